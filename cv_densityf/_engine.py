@@ -1,0 +1,92 @@
+"""The one place that calls cv2's estimator, and the names of its methods."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cv_densityf._epipolar import Rule
+
+try:
+    #: Bound once, so that a later patch of ``cv2.findFundamentalMat`` cannot call itself.
+    original = cv2.findFundamentalMat
+except AttributeError:
+    raise ImportError(
+        "this cv2 has no findFundamentalMat; install a full build of OpenCV: "
+        "python -m pip install opencv-contrib-python-headless"
+    ) from None
+
+METHODS: dict[str, int] = {
+    "7point": cv2.FM_7POINT,
+    "8point": cv2.FM_8POINT,
+    "lmeds": cv2.FM_LMEDS,
+    "ransac": cv2.FM_RANSAC,
+    "usac_default": cv2.USAC_DEFAULT,
+    "usac_parallel": cv2.USAC_PARALLEL,
+    "usac_fm_8pts": cv2.USAC_FM_8PTS,
+    "usac_fast": cv2.USAC_FAST,
+    "usac_accurate": cv2.USAC_ACCURATE,
+    "usac_prosac": cv2.USAC_PROSAC,
+    "usac_magsac": cv2.USAC_MAGSAC,
+}
+
+_USAC_FLAGS = range(cv2.USAC_DEFAULT, cv2.USAC_MAGSAC + 1)
+
+
+def method_flag(method: str | int) -> int:
+    """Turn a method's name, or its cv2 constant, into the cv2 constant.
+
+    Raises
+    ------
+    ValueError
+        If the name or the constant is not one of cv2's.
+    """
+    if isinstance(method, str):
+        name = method.lower().removeprefix("fm_")
+        if name in METHODS:
+            return METHODS[name]
+    elif int(method) in METHODS.values():
+        return int(method)
+    raise ValueError(f"unknown method {method!r}; choose one of {', '.join(METHODS)}")
+
+
+def is_usac(flag: int) -> bool:
+    """Whether cv2 sends this method to its USAC framework."""
+    return flag in _USAC_FLAGS
+
+
+@dataclass(frozen=True, slots=True)
+class Robust:
+    """What the caller asked of cv2: a method and its numbers, or a ``cv2.UsacParams``."""
+
+    flag: int
+    threshold: float
+    confidence: float
+    max_iters: int
+    params: cv2.UsacParams | None = None
+
+    @property
+    def rule(self) -> Rule:
+        """The rule by which cv2 makes this method's mask."""
+        if self.params is not None or is_usac(self.flag):
+            return "usac"
+        return "ransac" if self.flag & ~3 == cv2.FM_RANSAC else "lmeds"
+
+    def plain(
+        self, points1: Any, points2: Any
+    ) -> tuple[NDArray[np.float64] | None, NDArray[np.uint8] | None]:
+        """Make cv2's own call; (None, None) where its solver raises or finds nothing."""
+        try:
+            if self.params is not None:
+                F, mask = original(points1, points2, self.params)
+            else:
+                F, mask = original(
+                    points1, points2, self.flag, self.threshold, self.confidence, self.max_iters
+                )
+        except cv2.error:
+            return None, None
+        return (F, mask) if F is not None else (None, None)
