@@ -34,13 +34,28 @@ def usable(F: ArrayLike | None) -> Floats | None:
 
 def epipolar_distance(F: Floats, X: Floats) -> Floats:
     """Mean of the two point-to-epipolar-line distances of each match, pixels, (n,)."""
+    algebraic, norm1, norm2 = _algebraic(F, X)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (algebraic / norm1 + algebraic / norm2) / 2
+
+
+def sampson_distance(F: Floats, X: Floats) -> Floats:
+    """First-order distance of each match to the epipolar geometry, pixels, (n,)."""
+    algebraic, norm1, norm2 = _algebraic(F, X)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return algebraic / np.hypot(norm1, norm2)
+
+
+def _algebraic(F: Floats, X: Floats) -> tuple[Floats, Floats, Floats]:
+    """|x2' F x1|, and the norms of the normals of the epipolar lines in image 1 and 2."""
     one = np.ones((len(X), 1))
     x1, x2 = np.hstack([X[:, :2], one]), np.hstack([X[:, 2:], one])
     line2, line1 = x1 @ F.T, x2 @ F
-    algebraic = np.abs((x2 * line2).sum(axis=1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        d = algebraic / np.hypot(*line1[:, :2].T) + algebraic / np.hypot(*line2[:, :2].T)
-    return d / 2
+    return (
+        np.abs((x2 * line2).sum(axis=1)),
+        np.hypot(line1[:, 0], line1[:, 1]),
+        np.hypot(line2[:, 0], line2[:, 1]),
+    )
 
 
 def epipolar_error(F: ArrayLike | None, truth: Floats) -> float:
