@@ -1,0 +1,479 @@
+"""Pictures of matches and of what was made of them, with matplotlib.
+
+Every function draws into the axes it is given, or into those of a new figure, and returns them.
+The colours are Okabe and Ito's, which colour-blind readers tell apart; where a difference
+matters, marker shapes or numbers show it as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cv_densityf.matching import _grey
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442")
+#: Between two images, as a share of the first one's width.
+_GAP = 0.02
+
+
+class _Peaks(Protocol):
+    """What a decision graph needs of density peaks."""
+
+    @property
+    def rho(self) -> NDArray[Any]: ...
+    @property
+    def delta(self) -> NDArray[np.float64]: ...
+
+
+@dataclass(frozen=True)
+class _Style:
+    """How one class of matches is drawn."""
+
+    label: str
+    color: str
+    marker: str
+    alpha: float
+    order: int
+
+
+_STYLES = {
+    # (kept, inlier)
+    (False, False): _Style("dropped", "#333333", ".", 0.6, 2),
+    (True, False): _Style("kept, not an inlier", "#D55E00", "x", 0.9, 3),
+    (True, True): _Style("kept, inlier", "#0072B2", "o", 0.9, 4),
+    (False, True): _Style("dropped, yet inlier", "#E69F00", "^", 1.0, 5),
+}
+
+
+def plot_decision_graph(
+    peaks: _Peaks,
+    *,
+    alpha: float = 0.011,
+    kept: ArrayLike | None = None,
+    mask: ArrayLike | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the decision graph: distance to a denser match against density.
+
+    Parameters
+    ----------
+    peaks : DensityPeaksResult
+        From `cv_densityf.density_peaks`; anything with ``rho`` and ``delta``, each (n,).
+    alpha : float
+        The curve is where rho * delta = alpha * max(rho) * max(delta).
+    kept : (n,) array of bool, optional
+        Matches that hypotheses were drawn from; by default those on or above the curve.
+    mask : (n,) array of bool, optional
+        Inliers of the final fundamental matrix; by default they are not told apart.
+    ax : matplotlib.axes.Axes, optional
+        Where to draw; by default a new figure.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    ValueError
+        If ``kept`` or ``mask`` has another length than ``peaks``.
+
+    References
+    ----------
+    Rodriguez and Laio, Clustering by fast search and find of density peaks, Science 2014.
+    Wu and Wan, Clustering assisted fundamental matrix estimation, 2015.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from types import SimpleNamespace
+    >>> from cv_densityf.plotting import plot_decision_graph
+    >>> peaks = SimpleNamespace(rho=np.array([9, 5, 1]), delta=np.array([80.0, 3.0, 40.0]))
+    >>> ax = plot_decision_graph(peaks, mask=[True, False, False])
+    >>> ax.get_xlabel()
+    'rho, density: matches closer than the cut-off distance'
+    """
+    rho, delta = np.asarray(peaks.rho), np.asarray(peaks.delta)
+    product = alpha * rho.max(initial=0) * delta.max(initial=0)
+    on_or_above = rho * delta >= product
+    kept = on_or_above if kept is None else _mask(kept, len(rho), "kept")
+    mask = None if mask is None else _mask(mask, len(rho), "mask")
+    ax = _axes(ax, (16, 7))
+    handles = []
+    for style, rows in _classes(kept, mask):
+        (handle,) = ax.plot(
+            rho[rows], delta[rows], ls="none", marker=style.marker, color=style.color,
+            ms=_marker_size(style), mew=_edge(style), alpha=style.alpha, zorder=style.order,
+            label=f"{style.label} ({len(rows)})",
+        )  # fmt: skip
+        handles.append(handle)
+    ax.set_yscale("symlog", linthresh=1)
+    if product > 0:
+        top, right = 1.5 * delta.max(), 1.03 * rho.max()
+        bottom = 0.7 * delta.min() if delta.min() > 0 else -0.2
+        x = np.geomspace(product / top, right, 400)
+        label = f"rho x delta = {alpha:g} x max rho x max delta"
+        handles += ax.plot(x, product / x, color="black", lw=1.6, ls="--", zorder=6, label=label)
+        ax.set(xlim=(-0.02 * right, right), ylim=(bottom, top))
+    ax.set_xlabel("rho, density: matches closer than the cut-off distance")
+    ax.set_ylabel("delta, distance to a denser match (px)")
+    ax.grid(alpha=0.25)
+    _legend_above(ax, handles)
+    return ax
+
+
+def plot_matches(
+    image1: NDArray[Any] | None,
+    image2: NDArray[Any] | None,
+    X: ArrayLike,
+    kept: ArrayLike | None = None,
+    mask: ArrayLike | None = None,
+    *,
+    max_lines: int = 150,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the matches of two images side by side: dropped, kept and inliers.
+
+    Parameters
+    ----------
+    image1, image2 : (h, w) or (h, w, channels) array or None
+        Shown in grey, so that the matches stand out. None leaves the place blank.
+    X : (n, 4) array
+        The columns x, y, x', y', in pixels; rows that are not finite are left out.
+    kept : (n,) array of bool, optional
+        Matches that hypotheses were drawn from; by default all.
+    mask : (n,) array of bool, optional
+        Inliers of the final fundamental matrix; by default they are not told apart.
+    max_lines : int
+        Every match gets its two points; about this many, evenly chosen, also get the line that
+        joins them.
+    ax : matplotlib.axes.Axes, optional
+        Where to draw; by default a new figure.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    ValueError
+        If a shape does not fit.
+
+    Examples
+    --------
+    >>> from cv_densityf.datasets import two_view_scene
+    >>> from cv_densityf.plotting import plot_matches
+    >>> scene = two_view_scene(100)
+    >>> ax = plot_matches(None, None, scene.X, mask=scene.inliers)
+    >>> [text.get_text() for text in ax.get_legend().get_texts()]
+    ['kept, not an inlier (60)', 'kept, inlier (40)']
+    """
+    X = _matches(X)
+    finite: NDArray[np.bool_] = np.isfinite(X).all(axis=1)
+    kept = finite if kept is None else _mask(kept, len(X), "kept")
+    mask = None if mask is None else _mask(mask, len(X), "mask")[finite]
+    X, kept = X[finite], kept[finite]
+    ax = _axes(ax, (16, 6))
+    shift1, shift2, _ = _show(ax, image1, image2, X)
+    shown1, shown2 = X[:, :2] + shift1, X[:, 2:] + shift2
+
+    from matplotlib.collections import LineCollection
+
+    lined = np.zeros(len(X), dtype=bool)
+    lined[:: max(1, -(-len(X) // max(1, max_lines)))] = max_lines > 0
+    handles = []
+    for style, rows in _classes(kept, mask):
+        strong = style.label != "dropped"
+        joined = rows[lined[rows]]
+        segments = np.stack([shown1[joined], shown2[joined]], axis=1)
+        lines = LineCollection(
+            list(segments), colors=style.color, linewidths=1.0 if strong else 0.6,
+            alpha=0.75 if strong else 0.5, zorder=style.order,
+        )  # fmt: skip
+        ax.add_collection(lines, autolim=False)
+        (handle,) = ax.plot(
+            *np.vstack([shown1[rows], shown2[rows]]).T, ls="none", marker=style.marker,
+            ms=_marker_size(style), mew=_edge(style), color=style.color, alpha=style.alpha,
+            zorder=style.order + 10, label=f"{style.label} ({len(rows)})",
+        )  # fmt: skip
+        handles.append(handle)
+    _legend_above(ax, handles)
+    return ax
+
+
+def plot_epipolar_lines(
+    image1: NDArray[Any] | None,
+    image2: NDArray[Any] | None,
+    X: ArrayLike,
+    F: ArrayLike,
+    mask: ArrayLike | None = None,
+    *,
+    n_lines: int = 10,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw a few matches with the epipolar lines on which they should lie.
+
+    Parameters
+    ----------
+    image1, image2 : (h, w) or (h, w, channels) array or None
+        Shown in grey. None leaves the place blank.
+    X : (n, 4) array
+        The columns x, y, x', y', in pixels.
+    F : (3, 3) array
+        Fundamental matrix, ``[x', y', 1] @ F @ [x, y, 1] == 0``.
+    mask : (n,) array of bool, optional
+        Inliers, of which some far from each other are drawn; by default all rows count.
+    n_lines : int
+        How many matches are drawn.
+    ax : matplotlib.axes.Axes, optional
+        Where to draw; by default a new figure.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    ValueError
+        If a shape does not fit.
+
+    Examples
+    --------
+    >>> from cv_densityf.datasets import two_view_scene
+    >>> from cv_densityf.plotting import plot_epipolar_lines
+    >>> scene = two_view_scene(100)
+    >>> ax = plot_epipolar_lines(None, None, scene.X, scene.F, scene.inliers, n_lines=5)
+    >>> sorted({text.get_text() for text in ax.texts})
+    ['1', '2', '3', '4', '5']
+    """
+    X, F = _matches(X), np.asarray(F, dtype=np.float64)
+    if F.shape != (3, 3):
+        raise ValueError(f"F must have the shape (3, 3), not {F.shape}")
+    finite: NDArray[np.bool_] = np.isfinite(X).all(axis=1)
+    mask = finite if mask is None else _mask(mask, len(X), "mask")
+    ax = _axes(ax, (16, 6))
+    shift1, shift2, extents = _show(ax, image1, image2, X[finite])
+    for number, row in enumerate(_far_apart(X, np.flatnonzero(mask & finite), n_lines)):
+        color = _OKABE_ITO[number % len(_OKABE_ITO)]
+        point1, point2 = X[row, :2], X[row, 2:]
+        lines = (F.T @ [*point2, 1], F @ [*point1, 1])
+        sides = zip((point1, point2), lines, (shift1, shift2), extents, strict=True)
+        for point, line, shift, extent in sides:
+            ends = _clipped(line, extent)
+            if ends is not None:
+                ax.plot(*(ends + shift).T, color="black", lw=3.2, alpha=0.6, zorder=3)
+                ax.plot(*(ends + shift).T, color=color, lw=1.8, zorder=4)
+            x, y = point + shift
+            ax.plot(x, y, "o", ms=7, color=color, mec="black", mew=1, zorder=5)
+            ax.annotate(
+                str(number + 1), (x, y), (6, 6), textcoords="offset points", fontsize=11,
+                fontweight="bold", zorder=6, annotation_clip=False,
+                bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": color, "alpha": 0.9},
+            )  # fmt: skip
+    return ax
+
+
+def summary_figure(
+    image1: NDArray[Any] | None,
+    image2: NDArray[Any] | None,
+    X: ArrayLike,
+    F: ArrayLike,
+    *,
+    kept: ArrayLike,
+    mask: ArrayLike,
+    peaks: _Peaks,
+    alpha: float = 0.011,
+) -> Figure:
+    """Draw matches, epipolar lines and decision graph below each other, 1600 pixels wide.
+
+    Parameters
+    ----------
+    image1, image2 : (h, w) or (h, w, channels) array or None
+        The images; None leaves the place blank.
+    X : (n, 4) array
+        The matches, all finite.
+    F : (3, 3) array
+        Fundamental matrix.
+    kept, mask : (n,) array of bool
+        Matches that hypotheses were drawn from, and inliers of ``F``.
+    peaks : DensityPeaksResult
+        Density peaks of ``X``.
+    alpha : float
+        Of the curve in the decision graph.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Not known to pyplot, so that no display is needed and nothing has to be closed.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    """
+    figure = _figure((16, 18))
+    axes = figure.subplots(3, 1)
+    plot_matches(image1, image2, X, kept, mask, ax=axes[0])
+    plot_epipolar_lines(image1, image2, X, F, mask, ax=axes[1])
+    axes[1].set_title("Epipolar lines of a few inliers", fontsize=13)
+    plot_decision_graph(peaks, alpha=alpha, kept=kept, mask=mask, ax=axes[2])
+    return figure
+
+
+def _figure(size: tuple[float, float]) -> Figure:
+    """Make a figure of 100 dots per inch that is not known to pyplot."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise ImportError(
+            "plots need matplotlib: python -m pip install matplotlib "
+            "(or the extra cv-densityf[plot])"
+        ) from None
+    return Figure(figsize=size, dpi=100, layout="constrained")
+
+
+def _axes(ax: Axes | None, size: tuple[float, float]) -> Axes:
+    if ax is not None:
+        return ax
+    _figure((1, 1))  # says what to install where matplotlib is missing
+    import matplotlib.pyplot as plt
+
+    return plt.subplots(figsize=size, dpi=100, layout="constrained")[1]
+
+
+def _matches(X: ArrayLike) -> NDArray[np.float64]:
+    X = np.asarray(X, dtype=np.float64)
+    if X.ndim != 2 or X.shape[1] != 4:
+        raise ValueError(f"X must have the shape (n, 4), the columns x, y, x', y', not {X.shape}")
+    return X
+
+
+def _mask(values: ArrayLike, n: int, name: str) -> NDArray[np.bool_]:
+    mask = np.asarray(values).astype(bool)
+    if mask.shape != (n,):
+        raise ValueError(f"{name} must have the shape ({n},), not {mask.shape}")
+    return mask
+
+
+def _classes(
+    kept: NDArray[np.bool_], mask: NDArray[np.bool_] | None
+) -> Iterator[tuple[_Style, NDArray[np.intp]]]:
+    """Yield the style and the rows of each class that has any, the least important first."""
+    for (is_kept, is_inlier), style in _STYLES.items():
+        if mask is None:
+            # Nothing is known of inliers: neither claim them nor deny them.
+            style = replace(style, label="kept" if is_kept else "dropped")
+            chosen = (kept == is_kept) if is_kept == is_inlier else np.zeros_like(kept)
+        else:
+            chosen = (kept == is_kept) & (mask == is_inlier)
+        rows = np.flatnonzero(chosen)
+        if len(rows):
+            yield style, rows
+
+
+def _show(
+    ax: Axes, image1: NDArray[Any] | None, image2: NDArray[Any] | None, X: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[NDArray[np.float64], ...]]:
+    """Show the images side by side; the shift of each one's points, and their extents.
+
+    An extent is ((left, top), (right, bottom)) in pixels of the image itself.
+    """
+    extents = tuple(
+        _extent(image, points) for image, points in ((image1, X[:, :2]), (image2, X[:, 2:]))
+    )
+    (low1, high1), (low2, _) = extents
+    gap = _GAP * (high1[0] - low1[0])
+    shift1 = -low1
+    shift2 = np.array([high1[0] - low1[0] + gap, 0]) - low2
+    for image, extent, shift in zip((image1, image2), extents, (shift1, shift2), strict=True):
+        (left, top), (right, bottom) = extent + shift
+        if image is not None:
+            # Only the light greys: lines and points stay visible on them.
+            ax.imshow(
+                _grey(image), cmap="gray", vmin=-450, vmax=255, extent=(left, right, bottom, top),
+                interpolation="antialiased", zorder=0,
+            )  # fmt: skip
+        frame = np.array([[left, right, right, left, left], [top, top, bottom, bottom, top]])
+        ax.plot(*frame, color="0.4", lw=1, zorder=1, clip_on=False)
+    corners = np.vstack([extents[0] + shift1, extents[1] + shift2])
+    (left, top), (right, bottom) = corners.min(axis=0), corners.max(axis=0)
+    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+    ax.axis("off")
+    return shift1, shift2, extents
+
+
+def _extent(image: NDArray[Any] | None, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    if image is not None:
+        height, width = image.shape[:2]
+        return np.array([[-0.5, -0.5], [width - 0.5, height - 0.5]])
+    if len(points) == 0:
+        return np.array([[0.0, 0.0], [1.0, 1.0]])
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.03 * max(float((high - low).max()), 1e-9)
+    return np.array([low - margin, high + margin])
+
+
+def _legend_above(ax: Axes, handles: list[Any]) -> None:
+    if handles:
+        ax.legend(
+            handles=handles, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=5,
+            frameon=False, fontsize=11, markerscale=1.6, columnspacing=1.5,
+        )  # fmt: skip
+
+
+def _marker_size(style: _Style) -> float:
+    return {".": 5.0, "x": 5.0, "o": 4.5, "^": 5.5}[style.marker]
+
+
+def _edge(style: _Style) -> float:
+    return 1.4 if style.marker == "x" else 0.0
+
+
+def _far_apart(X: NDArray[np.float64], rows: NDArray[np.intp], n: int) -> list[int]:
+    """Choose rows of ``X`` that are far from each other in the first image, greedily."""
+    if len(rows) == 0 or n < 1:
+        return []
+    points = X[rows, :2]
+    chosen = [int(np.argmin(np.linalg.norm(points - np.median(points, axis=0), axis=1)))]
+    distance = np.linalg.norm(points - points[chosen[0]], axis=1)
+    while len(chosen) < min(n, len(rows)):
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return [int(rows[i]) for i in chosen]
+
+
+def _clipped(line: NDArray[np.float64], extent: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Cut the line a x + b y + c = 0 at a rectangle: its ends (2, 2), None where it misses."""
+    a, b, c = line
+    (left, top), (right, bottom) = extent
+    ends = []
+    if abs(b) > 0:
+        ends += [(x, -(a * x + c) / b) for x in (left, right)]
+    if abs(a) > 0:
+        ends += [(-(b * y + c) / a, y) for y in (top, bottom)]
+    slack = 1e-9 * float(np.abs(extent).max())
+    inside = [
+        (x, y)
+        for x, y in ends
+        if left - slack <= x <= right + slack and top - slack <= y <= bottom + slack
+    ]
+    if len(inside) < 2:
+        return None
+    # A line through a corner crosses two sides there: the two crossings farthest apart are meant.
+    points = np.array(inside)
+    along = points @ np.array([-b, a])
+    return points[[int(along.argmin()), int(along.argmax())]]
