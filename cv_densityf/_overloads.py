@@ -1,0 +1,134 @@
+"""Which of ``cv2.findFundamentalMat``'s three overloads a call means, and with what values."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+
+#: Parameter names of the overloads in the order cv2 tries them.
+WITH_MAX_ITERS = (
+    "points1",
+    "points2",
+    "method",
+    "ransacReprojThreshold",
+    "confidence",
+    "maxIters",
+    "mask",
+)
+WITH_DEFAULTS = ("points1", "points2", "method", "ransacReprojThreshold", "confidence", "mask")
+WITH_PARAMS = ("points1", "points2", "params", "mask")
+
+_INT32 = range(-(2**31), 2**31)
+
+
+class Call(NamedTuple):
+    """A call as cv2 understands it. Points and mask are still whatever the caller gave."""
+
+    points1: Any
+    points2: Any
+    method: int
+    threshold: float
+    confidence: float
+    max_iters: int
+    params: cv2.UsacParams | None
+    mask: Any
+
+
+def resolve(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Call | None:
+    """Bind a call the way cv2 binds it; None for a call that cv2 refuses.
+
+    The point arrays and the mask are not looked at: they do not decide the overload, except that a
+    sixth positional argument which is no integer is a mask and not ``maxIters``.
+    """
+    bound = _bind(WITH_MAX_ITERS, 6, args, kwargs)
+    if bound is not None:
+        method = _as_int(bound["method"], 0)
+        threshold = _as_float(bound["ransacReprojThreshold"], 0.0)
+        confidence = _as_float(bound["confidence"], 0.0)
+        max_iters = _as_int(bound["maxIters"], 0)
+        if not (method is None or threshold is None or confidence is None or max_iters is None):
+            return Call(
+                bound["points1"],
+                bound["points2"],
+                method,
+                threshold,
+                confidence,
+                max_iters,
+                None,
+                bound.get("mask"),
+            )
+    bound = _bind(WITH_DEFAULTS, 2, args, kwargs)
+    if bound is not None:
+        method = _as_int(bound.get("method"), cv2.FM_RANSAC)
+        threshold = _as_float(bound.get("ransacReprojThreshold"), 3.0)
+        confidence = _as_float(bound.get("confidence"), 0.99)
+        if not (method is None or threshold is None or confidence is None):
+            return Call(
+                bound["points1"],
+                bound["points2"],
+                method,
+                threshold,
+                confidence,
+                1000,
+                None,
+                bound.get("mask"),
+            )
+    bound = _bind(WITH_PARAMS, 3, args, kwargs)
+    if bound is not None:
+        params = bound["params"]
+        if params is None:
+            params = cv2.UsacParams()
+        if isinstance(params, cv2.UsacParams):
+            return Call(
+                bound["points1"],
+                bound["points2"],
+                cv2.USAC_DEFAULT,
+                params.threshold,
+                params.confidence,
+                params.maxIterations,
+                params,
+                bound.get("mask"),
+            )
+    return None
+
+
+def _bind(
+    names: tuple[str, ...], n_required: int, args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> dict[str, Any] | None:
+    if len(args) > len(names) or len(args) + len(kwargs) < n_required:
+        return None
+    bound = dict(zip(names, args, strict=False))
+    for name, value in kwargs.items():
+        if name in bound or name not in names:
+            return None
+        bound[name] = value
+    for name in names[len(args) : n_required]:
+        if name not in bound:
+            return None
+    return bound
+
+
+def _as_int(value: Any, if_none: int) -> int | None:
+    """Return the value of cv2's ``int`` slot, or None where cv2 refuses ``value``."""
+    if value is None:
+        return if_none
+    if isinstance(value, (bool, np.timedelta64)) or not isinstance(value, (int, np.integer)):
+        return None
+    number = int(value)
+    return number if number in _INT32 else None
+
+
+def _as_float(value: Any, if_none: float) -> float | None:
+    """Return the value of cv2's ``double`` slot, or None where cv2 refuses ``value``."""
+    if value is None:
+        return if_none
+    if isinstance(value, (bool, np.timedelta64)) or not isinstance(
+        value, (float, int, np.integer, np.float32, np.float16)
+    ):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return None

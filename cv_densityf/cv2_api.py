@@ -1,0 +1,393 @@
+"""`findFundamentalMat`: cv2's function, call for call, with the density pipeline behind it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal, NamedTuple, overload
+
+import cv2
+import numpy as np
+from cv2.typing import MatLike
+from numpy.typing import ArrayLike, NDArray
+
+from cv_densityf._engine import Robust, is_usac, original
+from cv_densityf._estimate import MIN_FILTERED, run
+from cv_densityf._overloads import Call, resolve
+from cv_densityf._points import as_array, as_matches, as_umat, n_points
+
+Density = Literal["contrast", "paper", "off"]
+
+_OPENCV_5 = int(cv2.__version__.split(".")[0]) >= 5
+
+#: Methods that go through the density pipeline: the rest of cv2's are not robust estimators, and an
+#: unknown number is LMEDS to cv2.
+_ROBUST = frozenset((cv2.FM_LMEDS, cv2.FM_RANSAC, *range(cv2.USAC_DEFAULT, cv2.USAC_MAGSAC + 1)))
+
+#: OpenCV 5.0 runs out of memory or kills the process when graph cut gets 49,000 points.
+_GRAPH_CUT_MAX = 40_000
+
+#: Below this threshold cv2's MAGSAC raises whatever the points are.
+_MAGSAC_MIN_THRESHOLD = 1e-3
+
+
+@overload
+def findFundamentalMat(
+    points1: MatLike,
+    points2: MatLike,
+    method: int,
+    ransacReprojThreshold: float,
+    confidence: float,
+    maxIters: int,
+    mask: MatLike | None = ...,
+    *,
+    density: Density = ...,
+    alpha: float = ...,
+    dc_percent: float = ...,
+    scores: ArrayLike | None = ...,
+) -> tuple[MatLike, MatLike]: ...
+@overload
+def findFundamentalMat(
+    points1: cv2.UMat,
+    points2: cv2.UMat,
+    method: int,
+    ransacReprojThreshold: float,
+    confidence: float,
+    maxIters: int,
+    mask: cv2.UMat | None = ...,
+    *,
+    density: Density = ...,
+    alpha: float = ...,
+    dc_percent: float = ...,
+    scores: ArrayLike | None = ...,
+) -> tuple[MatLike, cv2.UMat]: ...
+@overload
+def findFundamentalMat(
+    points1: MatLike,
+    points2: MatLike,
+    method: int = ...,
+    ransacReprojThreshold: float = ...,
+    confidence: float = ...,
+    mask: MatLike | None = ...,
+    *,
+    density: Density = ...,
+    alpha: float = ...,
+    dc_percent: float = ...,
+    scores: ArrayLike | None = ...,
+) -> tuple[MatLike, MatLike]: ...
+@overload
+def findFundamentalMat(
+    points1: cv2.UMat,
+    points2: cv2.UMat,
+    method: int = ...,
+    ransacReprojThreshold: float = ...,
+    confidence: float = ...,
+    mask: cv2.UMat | None = ...,
+    *,
+    density: Density = ...,
+    alpha: float = ...,
+    dc_percent: float = ...,
+    scores: ArrayLike | None = ...,
+) -> tuple[MatLike, cv2.UMat]: ...
+@overload
+def findFundamentalMat(
+    points1: MatLike,
+    points2: MatLike,
+    params: cv2.UsacParams,
+    mask: MatLike | None = ...,
+    *,
+    density: Density = ...,
+    alpha: float = ...,
+    dc_percent: float = ...,
+    scores: ArrayLike | None = ...,
+) -> tuple[MatLike, MatLike]: ...
+@overload
+def findFundamentalMat(
+    points1: cv2.UMat,
+    points2: cv2.UMat,
+    params: cv2.UsacParams,
+    mask: cv2.UMat | None = ...,
+    *,
+    density: Density = ...,
+    alpha: float = ...,
+    dc_percent: float = ...,
+    scores: ArrayLike | None = ...,
+) -> tuple[MatLike, cv2.UMat]: ...
+def findFundamentalMat(
+    *args: Any,
+    density: str = "contrast",
+    alpha: float = 0.011,
+    dc_percent: float = 2.0,
+    scores: ArrayLike | None = None,
+    **kwargs: Any,
+) -> Any:
+    """Fundamental matrix of two images from matched points, as ``cv2.findFundamentalMat``.
+
+    Takes every call that ``cv2.findFundamentalMat`` takes, positional or by keyword::
+
+        findFundamentalMat(points1, points2, method, ransacReprojThreshold, confidence, maxIters
+                           [, mask])
+        findFundamentalMat(points1, points2[, method[, ransacReprojThreshold[, confidence
+                           [, mask]]]])
+        findFundamentalMat(points1, points2, params[, mask])
+
+    For the robust methods on 15 points or more, hypotheses are drawn where the matches are dense in
+    (x, y, x', y'), refined on all matches, and chosen by a vote of all matches. Every other call,
+    and every call with ``density="off"``, is cv2's own.
+
+    Parameters
+    ----------
+    points1, points2 : array_like of cv2, shapes (N, 2), (N, 1, 2), (1, N, 2), ... or cv2.UMat
+        Matched points in pixels, row i of one with row i of the other. cv2 rounds them to float32.
+        (N, 3) is homogeneous: divided by the classic methods, its third column ignored by USAC.
+        Rows with NaN or infinity are never inliers.
+    method : int, default cv2.FM_RANSAC
+        ``cv2.FM_RANSAC``, ``cv2.FM_LMEDS`` or one of ``cv2.USAC_*``; any other is cv2's own call.
+    ransacReprojThreshold : float, default 3.0
+        Largest distance of an inlier from its epipolar line (``FM_RANSAC``) or Sampson distance
+        (``USAC_*``), pixels. ``FM_LMEDS`` ignores it.
+    confidence : float, default 0.99
+        Confidence wanted, inside (0, 1); other values are cv2's own call.
+    maxIters : int, default 1000
+        Most samples drawn. cv2 takes it only together with the three before it.
+    mask : array, optional
+        Output array, used as cv2 uses it: a writable contiguous uint8 (N, 1) array is filled and
+        returned.
+    params : cv2.UsacParams
+        All settings of USAC in one object, which is only read. ``randomGeneratorState`` is the
+        seed.
+    density : {"contrast", "paper", "off"}, default "contrast"
+        Where hypotheses are drawn: where matches are denser in 4-D than chance pairing of their
+        points explains; on the density peaks of [1]_; or no filter: cv2's own call.
+    alpha : float, default 0.011
+        Only for ``density="paper"``: a match is kept when its ``rho * delta`` reaches ``alpha``
+        times the largest ``rho`` times the largest ``delta``. At least 0.
+    dc_percent : float, default 2.0
+        Only for ``density="paper"``: mean number of neighbours within the cut-off distance, in per
+        cent of N. Inside (0, 100].
+    scores : (N,) array_like of float, optional
+        Trust in each match, higher is better: 1 - SIFT ratio, or a matcher's confidence.
+
+    Returns
+    -------
+    F : (3, 3) ndarray of float64, or None
+        ``[x', y', 1] @ F @ [x, y, 1] == 0``; None when no model was found. Exactly 7 points and a
+        classic method give up to three matrices below each other, (9, 3).
+    mask : (N, 1) ndarray of uint8, cv2.UMat if the points were, or None
+        1 for inliers: the method's own rule applied to ``F`` and all N matches. None together with
+        ``F`` for fewer than 7 points and where ``params`` finds no model.
+
+    Raises
+    ------
+    cv2.error
+        Where cv2 refuses the call: it is cv2's own error.
+    ValueError
+        For a wrong ``density``, ``alpha``, ``dc_percent`` or ``scores``.
+
+    See Also
+    --------
+    cv_densityf.estimate_fundamental : the same with method names and a full account of the result.
+
+    Notes
+    -----
+    Deliberate differences from cv2: where ``FM_RANSAC`` and ``FM_LMEDS`` find no model cv2 returns
+    uninitialised memory as the mask and leaves a given ``mask`` as it was; here both are zeros.
+    Where cv2's solver raises on valid points, or would take the process down (graph cut on more
+    than 40,000 points in OpenCV 5.0), this function goes on with another engine and answers
+    ``None`` only when that finds no model either.
+
+    References
+    ----------
+    .. [1] Y. Wu and X. Wan, fundamental matrix estimation with density peaks of matches.
+
+    Examples
+    --------
+    >>> import cv2
+    >>> import numpy as np
+    >>> from cv_densityf import findFundamentalMat
+    >>> rng = np.random.default_rng(0)
+    >>> points = rng.uniform((-2, -2, 4), (2, 2, 8), (100, 3))
+    >>> points1 = 800 * points[:, :2] / points[:, 2:]
+    >>> moved = points + [1, 0.2, 0.1]
+    >>> points2 = 800 * moved[:, :2] / moved[:, 2:]
+    >>> F, mask = findFundamentalMat(points1, points2, cv2.USAC_MAGSAC, 1.0, 0.999, 10000)
+    >>> F.shape, mask.shape, int(mask.sum())
+    ((3, 3), (100, 1), 100)
+    """
+    _check_options(density, alpha, dc_percent)
+    call = resolve(args, kwargs)
+    if call is None:
+        return original(*args, **kwargs)
+    usac = call.params is not None or is_usac(call.method)
+    points1, points2 = as_array(call.points1), as_array(call.points2)
+    n = None if points1 is None or points2 is None else _common_length(points1, points2, usac)
+    trust = None if scores is None else _check_scores(scores, n)
+    if points1 is None or points2 is None or n is None:
+        return _cv2s_answer(call, usac, args, kwargs)
+
+    slot = _mask_slot(call, n, usac)
+    ordinary = n >= MIN_FILTERED and _is_ordinary(call)
+    if density == "off" or not ordinary or slot is None:
+        if _OPENCV_5 and n > _GRAPH_CUT_MAX and _cuts_graph(call):
+            args, kwargs = _without_graph_cut(call), {}
+        try:
+            return _cv2s_answer(call, usac, args, kwargs)
+        except cv2.error as error:
+            if slot is None or not _is_solver_failure(error, call, n, usac):
+                raise
+        if not ordinary:
+            return _no_model(call, n, usac, slot)
+    estimate = run(
+        as_matches(points1, points2, n, usac),
+        Robust(
+            call.method,
+            # cv2's LMEDS makes its own threshold: no caller's number may change the result.
+            3.0 if call.method == cv2.FM_LMEDS else call.threshold,
+            call.confidence,
+            call.max_iters,
+            call.params,
+        ),
+        density=density,
+        alpha=alpha,
+        dc_percent=dc_percent,
+        scores=trust,
+        seed=0 if call.params is None else call.params.randomGeneratorState,
+    )
+    if estimate.F is None:
+        return _no_model(call, n, usac, slot)
+    return np.array(estimate.F, dtype=np.float64, order="C"), slot.deliver(estimate.mask)
+
+
+class _MaskSlot(NamedTuple):
+    """Where the mask of a call goes: into ``given``, or else into a new array or UMat."""
+
+    given: NDArray[np.uint8] | None
+    as_umat: bool
+
+    def deliver(self, mask: NDArray[Any]) -> NDArray[np.uint8] | cv2.UMat:
+        if self.given is not None:
+            self.given.reshape(-1)[:] = mask
+            return self.given
+        column = mask.astype(np.uint8).reshape(-1, 1)
+        return as_umat(column) if self.as_umat else column
+
+
+def _mask_slot(call: Call, n: int, usac: bool) -> _MaskSlot | None:
+    """Decide what cv2 does with the given mask; None where only cv2 can tell."""
+    mask = call.mask
+    as_umat = isinstance(call.points1, cv2.UMat) or isinstance(call.points2, cv2.UMat)
+    if mask is None:
+        return _MaskSlot(None, as_umat)
+    if as_umat:
+        return None
+    if isinstance(mask, (int, float)):
+        # cv2 takes a number for an array of its own and drops it: the fate of maxIters=1000.0.
+        return _MaskSlot(None, False)
+    if type(mask) is not np.ndarray or mask.dtype != np.uint8:
+        return None
+    if not (mask.flags.c_contiguous and mask.flags.writeable):
+        return None
+    if mask.shape == (n, 1) or (mask.shape == (n,) and not (usac and _OPENCV_5)):
+        return _MaskSlot(mask, False)
+    if mask.shape in ((1, n), (n,)):
+        return _MaskSlot(None if usac else mask, False)
+    return None
+
+
+def _common_length(points1: NDArray[Any], points2: NDArray[Any], usac: bool) -> int | None:
+    n = n_points(points1, usac)
+    return n if n == n_points(points2, usac) else None
+
+
+def _is_ordinary(call: Call) -> bool:
+    """Whether this is a robust method with numbers that mean to cv2 what they say."""
+    params = call.params
+    if params is None:
+        if call.method not in _ROBUST:
+            return False
+        magsac = call.method == cv2.USAC_MAGSAC
+    else:
+        if not (
+            params.sampler in range(4)
+            and params.score in range(4)
+            and params.loMethod in range(5)
+            and params.neighborsSearch in range(3)
+        ):
+            return False
+        magsac = params.score == cv2.SCORE_METHOD_MAGSAC
+    lowest = _MAGSAC_MIN_THRESHOLD if magsac else 0.0
+    return (
+        (lowest < call.threshold < math.inf or call.method == cv2.FM_LMEDS)
+        and 0.0 < call.confidence < 1.0
+        and call.max_iters > 0
+    )
+
+
+def _cuts_graph(call: Call) -> bool:
+    if call.params is not None:
+        return bool(call.params.loMethod == cv2.LOCAL_OPTIM_GC)
+    return call.method == cv2.USAC_ACCURATE
+
+
+def _without_graph_cut(call: Call) -> tuple[Any, ...]:
+    """Arguments of the same call with another local optimisation."""
+    if call.params is None:
+        return (*call[:2], cv2.USAC_DEFAULT, *call[3:6], call.mask)
+    params = cv2.UsacParams()
+    for name in dir(params):
+        if not name.startswith("_"):
+            setattr(params, name, getattr(call.params, name))
+    params.loMethod = cv2.LOCAL_OPTIM_INNER_AND_ITER_LO
+    return (*call[:2], params, call.mask)
+
+
+def _cv2s_answer(call: Call, usac: bool, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    """Make cv2's own call, and put zeros where it answers with uninitialised memory."""
+    F, mask = original(*args, **kwargs)
+    if F is not None or mask is None or usac or call.method == cv2.FM_8POINT:
+        return F, mask
+    # Fewer than 7 points leave the mask alone; exactly 7 are all inliers to cv2.
+    if isinstance(mask, cv2.UMat):
+        garbage = mask.get()
+        if garbage.size > 7:
+            no_mask: Any = None
+            cv2.copyTo(as_umat(np.zeros_like(garbage)), no_mask, mask)
+    elif mask.size > 7 and mask.flags.writeable:
+        mask[...] = 0
+    return F, mask
+
+
+def _is_solver_failure(error: cv2.error, call: Call, n: int, usac: bool) -> bool:
+    """Whether cv2 failed on the points, and not for the way it was called."""
+    if error.code != cv2.Error.StsAssert:
+        return False
+    if not usac:
+        return n >= 7 and not math.isnan(call.confidence)
+    return n >= (8 if call.method == cv2.USAC_FM_8PTS else 7) and _is_ordinary(call)
+
+
+def _no_model(call: Call, n: int, usac: bool, slot: _MaskSlot) -> tuple[None, Any]:
+    """Give cv2's answer for "no model found"."""
+    if call.params is not None:
+        return None, None
+    # cv2's direct solvers count every point as an inlier, model or not.
+    direct = not usac and (n == 7 or call.method == cv2.FM_8POINT)
+    return None, slot.deliver(np.full(n, direct))
+
+
+def _check_options(density: str, alpha: float, dc_percent: float) -> None:
+    if density not in ("contrast", "paper", "off"):
+        raise ValueError(f"density must be 'contrast', 'paper' or 'off', not {density!r}")
+    if not 0 <= alpha < math.inf:
+        raise ValueError(f"alpha must be a finite number of at least 0, not {alpha!r}")
+    if not 0 < dc_percent <= 100:
+        raise ValueError(f"dc_percent must be above 0 and at most 100, not {dc_percent!r}")
+
+
+def _check_scores(scores: ArrayLike, n: int | None) -> NDArray[np.float64]:
+    trust = np.asarray(scores, dtype=np.float64)
+    if trust.ndim != 1 or (n is not None and len(trust) != n):
+        rows = "one number" if n is None else f"{n} numbers, one"
+        raise ValueError(f"scores must be {rows} for each match, not shape {trust.shape}")
+    if not np.isfinite(trust).all():
+        raise ValueError("scores must be finite; give untrusted matches a low score")
+    return trust
