@@ -62,6 +62,26 @@ class ImagePair:
     points1: NDArray[np.float64]
     points2: NDArray[np.float64]
 
+    def error(self, F: NDArray[np.float64]) -> float:
+        """Mean distance of the true correspondences to the epipolar lines of ``F``.
+
+        Parameters
+        ----------
+        F : (3, 3) array
+            An estimate of the fundamental matrix.
+
+        Returns
+        -------
+        float
+            Pixels, over both images.
+        """
+        one = np.ones((len(self.points1), 1))
+        x1, x2 = np.hstack([self.points1, one]), np.hstack([self.points2, one])
+        line1, line2 = x2 @ F, x1 @ F.T
+        algebraic = np.abs((x2 * line2).sum(axis=1))
+        distances = [algebraic / np.hypot(line[:, 0], line[:, 1]) for line in (line1, line2)]
+        return float(np.mean(distances))
+
 
 def two_view_scene(
     n: int = 500,

@@ -181,7 +181,7 @@ def plot_matches(
     ['kept, not an inlier (60)', 'kept, inlier (40)']
     """
     X = _matches(X)
-    finite: NDArray[np.bool_] = np.isfinite(X).all(axis=1)
+    finite = _finite(X)
     kept = finite if kept is None else _mask(kept, len(X), "kept")
     mask = None if mask is None else _mask(mask, len(X), "mask")[finite]
     X, kept = X[finite], kept[finite]
@@ -263,7 +263,7 @@ def plot_epipolar_lines(
     X, F = _matches(X), np.asarray(F, dtype=np.float64)
     if F.shape != (3, 3):
         raise ValueError(f"F must have the shape (3, 3), not {F.shape}")
-    finite: NDArray[np.bool_] = np.isfinite(X).all(axis=1)
+    finite = _finite(X)
     mask = finite if mask is None else _mask(mask, len(X), "mask")
     ax = _axes(ax, (16, 6))
     shift1, shift2, extents = _show(ax, image1, image2, X[finite])
@@ -318,14 +318,14 @@ def summary_figure(
     Returns
     -------
     matplotlib.figure.Figure
-        Not known to pyplot, so that no display is needed and nothing has to be closed.
+        Not known to pyplot, see `new_figure`.
 
     Raises
     ------
     ImportError
         If matplotlib is not installed.
     """
-    figure = _figure((16, 18))
+    figure = new_figure(16, 18)
     axes = figure.subplots(3, 1)
     plot_matches(image1, image2, X, kept, mask, ax=axes[0])
     plot_epipolar_lines(image1, image2, X, F, mask, ax=axes[1])
@@ -334,22 +334,50 @@ def summary_figure(
     return figure
 
 
-def _figure(size: tuple[float, float]) -> Figure:
-    """Make a figure of 100 dots per inch that is not known to pyplot."""
+def require_matplotlib() -> None:
+    """Say what to install where matplotlib is missing.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib cannot be imported.
+    """
     try:
-        from matplotlib.figure import Figure
+        import matplotlib.figure  # noqa: F401
     except ImportError:
         raise ImportError(
             "plots need matplotlib: python -m pip install matplotlib "
             "(or the extra cv-densityf[plot])"
         ) from None
-    return Figure(figsize=size, dpi=100, layout="constrained")
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """Make a figure that is not known to pyplot: it needs no display, nothing has to be closed.
+
+    Parameters
+    ----------
+    width, height : float
+        Hundreds of pixels.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is not installed.
+    """
+    require_matplotlib()
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), dpi=100, layout="constrained")
 
 
 def _axes(ax: Axes | None, size: tuple[float, float]) -> Axes:
     if ax is not None:
         return ax
-    _figure((1, 1))  # says what to install where matplotlib is missing
+    require_matplotlib()
     import matplotlib.pyplot as plt
 
     return plt.subplots(figsize=size, dpi=100, layout="constrained")[1]
@@ -360,6 +388,10 @@ def _matches(X: ArrayLike) -> NDArray[np.float64]:
     if X.ndim != 2 or X.shape[1] != 4:
         raise ValueError(f"X must have the shape (n, 4), the columns x, y, x', y', not {X.shape}")
     return X
+
+
+def _finite(X: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return np.asarray(np.isfinite(X).all(axis=1))
 
 
 def _mask(values: ArrayLike, n: int, name: str) -> NDArray[np.bool_]:
