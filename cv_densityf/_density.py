@@ -1,0 +1,374 @@
+"""Clustering by density peaks: pure arrays in, pure arrays out, any number of columns."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist, pdist
+
+Kernel = Literal["cutoff", "gaussian"]
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+#: Up to here ``dc`` is an order statistic of all distances, beyond it of a sample of them.
+_EXACT_DC_ROWS = 4_000
+_DC_SAMPLE = 1_000_000
+_DC_SEED = 0
+#: Distances this close, relatively, differ by rounding only.
+_ROUNDING = 1e-9
+#: Entries of the largest temporary array of the blockwise loops.
+_BLOCK = 1 << 20
+#: Leaves of this size make range counts about twice as fast as scipy's default of 16.
+_LEAFSIZE = 64
+
+
+@dataclass(frozen=True, eq=False)
+class DensityPeaksResult:
+    """The decision graph of a set of points, and the clusters that follow from it.
+
+    Attributes
+    ----------
+    rho : ndarray of float64, shape (n,)
+        Local density.
+    delta : ndarray of float64, shape (n,)
+        Distance to the nearest denser point; for the densest point the largest distance to any.
+    gamma : ndarray of float64, shape (n,)
+        ``rho * delta``: large for the centre of a cluster.
+    dc : float
+        Cut-off distance, in the units of the points.
+    predecessor : ndarray of intp, shape (n,)
+        Row of the nearest denser point, -1 for the densest point.
+    X : ndarray of float64, shape (n, d)
+        The points.
+    """
+
+    rho: Floats
+    delta: Floats
+    gamma: Floats
+    dc: float
+    predecessor: Ints
+    X: Floats = field(repr=False)
+
+    def centers(self, *, alpha: float | None = None, n: int | None = None) -> Ints:
+        """Choose cluster centres, the largest ``gamma`` first.
+
+        Parameters
+        ----------
+        alpha : float in [0, 1], optional
+            Take the points with ``gamma >= alpha * rho.max() * delta.max()``, the rule of Wu and
+            Wan, section 2.6. The densest point always qualifies.
+        n : int in [1, number of points], optional
+            Take the ``n`` points with the largest ``gamma``; equal ``gamma`` is ordered by row.
+
+        Returns
+        -------
+        ndarray of intp
+            Rows of the centres. The first is the densest point.
+
+        Raises
+        ------
+        ValueError
+            Unless exactly one of ``alpha`` and ``n`` is given, within its range.
+        """
+        if (alpha is None) == (n is None):
+            raise ValueError("give exactly one of alpha (a threshold on gamma) and n (a number)")
+        order = np.argsort(-self.gamma, kind="stable")
+        if alpha is not None:
+            if not 0 <= alpha <= 1:
+                raise ValueError(f"alpha is a share of the largest gamma, in [0, 1]; got {alpha}")
+            chosen = self.gamma >= alpha * (self.rho.max() * self.delta.max())
+            return np.asarray(order[chosen[order]])
+        if n is None or not 1 <= n <= len(order):
+            raise ValueError(f"n must lie between 1 and the {len(order)} points; got {n}")
+        return np.asarray(order[:n])
+
+    def labels(self, centers: ArrayLike) -> Ints:
+        """Give every point the cluster of its nearest denser point.
+
+        Parameters
+        ----------
+        centers : array_like of int, shape (k,)
+            Rows of the centres, each once, as `centers` returns them.
+
+        Returns
+        -------
+        ndarray of intp, shape (n,)
+            Position in ``centers`` of the first centre met when following predecessors, or -1
+            where there is none, which happens only when ``centers`` lacks the densest point.
+
+        Raises
+        ------
+        ValueError
+            If a centre is not a row of the points or is given twice.
+        """
+        rows = np.asarray(centers, dtype=np.intp).ravel()
+        n = len(self.rho)
+        if rows.size and (rows.min() < 0 or rows.max() >= n or len(np.unique(rows)) < len(rows)):
+            raise ValueError(f"centers must be different row numbers between 0 and {n - 1}")
+        root = np.flatnonzero(self.predecessor < 0)
+        parent = self.predecessor.copy()
+        parent[root] = root
+        parent[rows] = rows
+        # Each pass doubles the length of the chains followed.
+        while not np.array_equal(grand := parent[parent], parent):
+            parent = grand
+        label = np.full(n, -1, dtype=np.intp)
+        label[rows] = np.arange(len(rows))
+        return np.asarray(label[parent])
+
+    def halo(self, labels: ArrayLike) -> NDArray[np.bool_]:
+        """Tell the rim of each cluster from its core.
+
+        A cluster's border holds its points with a point of another cluster nearer than ``dc``;
+        its points no denser than the densest of the border are its halo (Rodriguez and Laio).
+
+        Parameters
+        ----------
+        labels : array_like of int, shape (n,)
+            Cluster of each point, negative for none, as `labels` returns them.
+
+        Returns
+        -------
+        ndarray of bool, shape (n,)
+            True in the halo. Points without a cluster are in the halo.
+
+        Raises
+        ------
+        ValueError
+            If ``labels`` does not hold one label per point.
+        """
+        label = np.asarray(labels)
+        if label.shape != self.rho.shape:
+            raise ValueError(f"labels must have shape {self.rho.shape}; got {label.shape}")
+        halo = label < 0
+        rows = np.flatnonzero(~halo)
+        if not rows.size:
+            return halo
+        on_border = rows[_has_foreign_neighbor(self.X[rows], label[rows], self.dc)]
+        clusters, member = np.unique(label[rows], return_inverse=True)
+        border_rho = np.full(len(clusters), -np.inf)
+        np.maximum.at(border_rho, np.searchsorted(clusters, label[on_border]), self.rho[on_border])
+        halo[rows] = self.rho[rows] <= border_rho[member]
+        return halo
+
+
+def density_peaks(
+    X: ArrayLike,
+    *,
+    dc: float | None = None,
+    dc_percent: float = 2.0,
+    kernel: Kernel = "cutoff",
+) -> DensityPeaksResult:
+    """Density and distance to a denser point, for clustering by density peaks.
+
+    Parameters
+    ----------
+    X : array_like, shape (n, d)
+        Finite points, n >= 1 and d >= 1; the four columns x, y, x', y' for matches.
+    dc : float > 0, optional
+        Cut-off distance, in the units of ``X``. Chosen from ``dc_percent`` when None.
+    dc_percent : float in (0, 100], default=2.0
+        Choose ``dc`` so that a point has on average ``dc_percent`` % of n points nearer than
+        ``dc``: half way between the last distance that has to lie below it and the next larger
+        one, where a relative difference below 1e-9 counts as none. Up to 4,000 points all
+        distances are used. Beyond, a fixed pseudo-random sample of 1,000,000 pairs is: the mean
+        number of neighbours then misses its target by a relative standard error of
+        ``sqrt((100 / dc_percent - 1) / 1e6)``, 0.7 % at the default.
+    kernel : {"cutoff", "gaussian"}, default="cutoff"
+        ``"cutoff"``: rho is the number of other points strictly nearer than ``dc``.
+        ``"gaussian"``: rho is the sum of ``exp(-(d / dc)**2)`` over the other points.
+        Neither counts the point itself.
+
+    Returns
+    -------
+    DensityPeaksResult
+        ``rho``, ``delta``, ``gamma``, ``dc``, ``predecessor``, with the methods ``centers``,
+        ``labels`` and ``halo``.
+
+    Raises
+    ------
+    ValueError
+        If ``X`` is not a two-dimensional array of finite numbers with at least one row and one
+        column, if its squared distances overflow, or if a parameter is out of its range.
+
+    Notes
+    -----
+    ``rho`` and ``delta`` are exact for any n. Points of equal density are ordered by row, the
+    earlier row counts as denser; so there is one densest point, and every other has a predecessor.
+    Of several denser points at the same distance the densest is the predecessor. The densest
+    point's ``delta`` is the largest distance from it, 0 when all points coincide.
+
+    Equation (11) of Wu and Wan prints ``delta`` as a maximum over the denser points; their text
+    and Rodriguez and Laio define the minimum, as it is here.
+
+    Memory grows like n, not n**2 (beyond the 4,000 points whose distances are all looked at). Time
+    for ``"cutoff"`` is that of kd-tree counts; ``"gaussian"`` sums over all n**2 / 2 pairs.
+
+    References
+    ----------
+    A. Rodriguez and A. Laio, "Clustering by fast search and find of density peaks", Science 344
+    (2014) 1492-1496. H. Wu and Y. Wan, "Clustering assisted fundamental matrix estimation" (2015),
+    equations (9)-(11).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(0)
+    >>> X = np.concatenate([rng.normal(0, 1, (60, 4)), rng.normal(20, 1, (40, 4))])
+    >>> peaks = density_peaks(X)
+    >>> centers = peaks.centers(n=2)
+    >>> np.bincount(peaks.labels(centers))
+    array([40, 60])
+    """
+    X = _checked_points(X)
+    if dc is not None and not 0 < dc < math.inf:
+        raise ValueError(f"dc is a distance, finite and greater than 0; got {dc}")
+    if not 0 < dc_percent <= 100:
+        raise ValueError(f"dc_percent is a percentage in (0, 100]; got {dc_percent}")
+    if kernel not in ("cutoff", "gaussian"):
+        raise ValueError(f"kernel must be 'cutoff' or 'gaussian'; got {kernel!r}")
+
+    n = len(X)
+    if dc is None:
+        distances = pdist(X) if n <= _EXACT_DC_ROWS else _sampled_distances(X)
+        dc = _cutoff_distance(distances, n, dc_percent)
+    rho = _neighbor_counts(X, dc) if kernel == "cutoff" else _gaussian_density(X, dc)
+    order = np.argsort(-rho, kind="stable")
+    P = X[order]
+    parent, to_parent = _nearest_earlier(P)
+    delta, predecessor = np.empty(n), np.empty(n, dtype=np.intp)
+    delta[order] = to_parent
+    delta[order[0]] = cdist(P[:1], P).max()
+    predecessor[order] = order[parent]
+    predecessor[order[0]] = -1
+    return DensityPeaksResult(rho, delta, rho * delta, float(dc), predecessor, X)
+
+
+def _checked_points(X: ArrayLike) -> Floats:
+    points = np.ascontiguousarray(X, dtype=np.float64)
+    if points.ndim != 2 or 0 in points.shape:
+        raise ValueError(
+            "X must be a two-dimensional array with at least one row (a point) and one column; "
+            f"its shape is {np.shape(X)}"
+        )
+    if not np.isfinite(points).all():
+        raise ValueError("X holds NaN or infinite values; drop those rows first")
+    with np.errstate(over="ignore"):
+        if not np.isfinite(np.square(np.ptp(points, axis=0)).sum()):
+            raise ValueError("X spans so wide a range that squared distances overflow; rescale it")
+    return points
+
+
+def _cutoff_distance(distances: Floats, n: int, percent: float) -> float:
+    """Distance below which the share of pairs lies that makes the mean density ``percent`` % of n.
+
+    ``distances`` are those of all pairs, or of a sample of them.
+    """
+    if not distances.size:
+        return float(np.nextafter(0.0, 1.0))
+    share = min(percent / 100 * n / (n - 1), 1.0)
+    last = max(math.ceil(round(share * distances.size, 6)), 1) - 1
+    ranked = np.partition(distances, last)
+    below, rest = ranked[last], ranked[last + 1 :]
+    same = below * (1 + _ROUNDING)
+    above = rest.min(initial=np.inf)
+    if above <= same:
+        above = rest[rest > same].min(initial=np.inf)
+    # Half way, so that rounding of a distance decides about no pair.
+    return float((below + above) / 2 if above < np.inf else max(same, np.nextafter(0.0, 1.0)))
+
+
+def _sampled_distances(X: Floats) -> Floats:
+    """Distances of ``_DC_SAMPLE`` pairs of different rows, drawn with replacement."""
+    rng = np.random.default_rng(_DC_SEED)
+    i = rng.integers(0, len(X), _DC_SAMPLE)
+    j = (i + rng.integers(1, len(X), _DC_SAMPLE)) % len(X)
+    squared = np.zeros(_DC_SAMPLE)
+    for column in X.T:
+        squared += np.square(column[i] - column[j])
+    return np.asarray(np.sqrt(squared))
+
+
+def _neighbor_counts(X: Floats, dc: float) -> Floats:
+    """Count the other points strictly nearer than ``dc``."""
+    tree = cKDTree(X, leafsize=_LEAFSIZE)
+    counts = np.empty(len(X))
+    # The tree counts distances up to its radius, the kernel those below dc. Asking in the tree's
+    # own order keeps its nodes in the cache.
+    counts[tree.indices] = tree.query_ball_point(
+        X[tree.indices], np.nextafter(dc, 0.0), return_length=True
+    )
+    return counts - 1
+
+
+def _gaussian_density(X: Floats, dc: float) -> Floats:
+    """Sum the Gaussian kernel over the other points, each pair once."""
+    n = len(X)
+    rho = np.zeros(n)
+    rows = max(_BLOCK // n, 1)
+    for start in range(0, n, rows):
+        stop = min(start + rows, n)
+        with np.errstate(over="ignore", under="ignore"):
+            weight = np.exp(-np.square(cdist(X[start:stop], X[start:]) / dc))
+        np.fill_diagonal(weight, 0)
+        rho[start:stop] += weight.sum(axis=1)
+        rho[stop:] += weight[:, stop - start :].sum(axis=0)
+    return rho
+
+
+def _nearest_earlier(P: Floats) -> tuple[Ints, Floats]:
+    """Nearest of the rows before each row and its distance, by kd-tree; row 0 is undefined."""
+    # Copies of a point would fill the neighbour lists: the first copy searches, and is the others'
+    # nearest.
+    _, first, copy_of = np.unique(P, axis=0, return_index=True, return_inverse=True)
+    nearest, distance = first[copy_of.ravel()], np.zeros(len(P))
+    first.sort()
+    found, to_found = _nearest_earlier_distinct(P[first])
+    nearest[first], distance[first] = first[found], to_found
+    return nearest, distance
+
+
+def _nearest_earlier_distinct(P: Floats) -> tuple[Ints, Floats]:
+    n = len(P)
+    nearest, distance = np.zeros(n, dtype=np.intp), np.zeros(n)
+    pending = np.arange(1, n)
+    tree = cKDTree(P, leafsize=_LEAFSIZE)
+    k = 9
+    # A small matrix is quicker than the tree.
+    while pending.size * n > _BLOCK and k < n:
+        to_neighbor, neighbor = tree.query(P[pending], k)
+        candidate = np.where(neighbor < pending[:, None], to_neighbor, np.inf)
+        shortest = candidate.min(axis=1)
+        # A tie with the last neighbour may go on among those not listed.
+        settled = shortest < to_neighbor[:, -1]
+        row = pending[settled]
+        tied = candidate[settled] == shortest[settled, None]
+        nearest[row] = np.where(tied, neighbor[settled], n).min(axis=1)
+        distance[row] = shortest[settled]
+        pending = pending[~settled]
+        k *= 4
+    step = max(_BLOCK // n, 1)
+    for rows in (pending[i : i + step] for i in range(0, len(pending), step)):
+        to_row = cdist(P[rows], P[: rows[-1]])
+        to_row[np.arange(rows[-1]) >= rows[:, None]] = np.inf
+        nearest[rows] = to_row.argmin(axis=1)
+        distance[rows] = to_row[np.arange(len(rows)), nearest[rows]]
+    return nearest, distance
+
+
+def _has_foreign_neighbor(X: Floats, labels: NDArray[np.integer], dc: float) -> NDArray[np.bool_]:
+    """Whether a point with another label lies nearer than ``dc``."""
+    tree = cKDTree(X, leafsize=_LEAFSIZE)
+    result = np.zeros(len(X), dtype=bool)
+    # In the tree's own order a block is compact, and its pairs are found together.
+    ends = np.cumsum(tree.query_ball_point(X[tree.indices], dc, return_length=True))
+    for rows in np.split(tree.indices, np.flatnonzero(np.diff(ends // _BLOCK)) + 1):
+        pairs = cKDTree(X[rows]).sparse_distance_matrix(tree, dc, output_type="ndarray")
+        foreign = (labels[rows][pairs["i"]] != labels[pairs["j"]]) & (pairs["v"] < dc)
+        result[rows[pairs["i"][foreign]]] = True
+    return result

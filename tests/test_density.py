@@ -1,0 +1,207 @@
+"""Density peaks against the definitions, ties and duplicates included."""
+
+from __future__ import annotations
+
+import tracemalloc
+from unittest import mock
+
+import numpy as np
+import pytest
+import reference_density as reference
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from cv_densityf import _density
+from cv_densityf._density import density_peaks
+
+KERNELS = ["cutoff", "gaussian"]
+
+#: Block sizes that force the kd-tree, the exact search behind it, or one plain matrix.
+blocks = st.sampled_from([1, 60, 1 << 20])
+shapes = st.tuples(st.integers(1, 40), st.integers(1, 5))
+#: On a small lattice distances are exact, and ties and duplicates are the rule.
+lattice = hnp.arrays(np.float64, shapes, elements=st.integers(0, 3).map(float))
+scattered = st.builds(
+    lambda seed, shape: np.random.default_rng(seed).normal(size=shape) * 100,
+    st.integers(0, 2**32 - 1),
+    shapes,
+)
+points = lattice | scattered
+
+
+def peaks_of(X, block=1 << 20, **options):
+    with mock.patch.object(_density, "_BLOCK", block):
+        return density_peaks(X, **options)
+
+
+@given(X=points, percent=st.floats(0.1, 100))
+def test_dc_is_the_order_statistic(X, percent):
+    low, high = reference.cutoff_interval(X.tolist(), percent)
+    dc = density_peaks(X, dc_percent=percent).dc
+    assert low * (1 - 1e-12) < dc <= high * (1 + 1e-12)
+
+
+@given(X=lattice, dc=st.integers(1, 18).map(lambda s: float(np.sqrt(s))))
+def test_cutoff_kernel_is_strict_at_the_boundary(X, dc):
+    assert density_peaks(X, dc=dc).rho.tolist() == reference.density(X.tolist(), dc, "cutoff")
+
+
+@given(X=points, block=blocks, kernel=st.sampled_from(KERNELS), percent=st.floats(0.1, 60))
+def test_density_is_the_definition(X, block, kernel, percent):
+    peaks = peaks_of(X, block, kernel=kernel, dc_percent=percent)
+    expected = reference.density(X.tolist(), peaks.dc, kernel)
+    np.testing.assert_allclose(peaks.rho, expected, rtol=1e-12, atol=1e-300)
+
+
+@given(X=points, block=blocks, kernel=st.sampled_from(KERNELS), percent=st.floats(0.1, 60))
+def test_delta_and_predecessor_are_the_definition(X, block, kernel, percent):
+    peaks = peaks_of(X, block, kernel=kernel, dc_percent=percent)
+    delta, predecessor = reference.delta_and_predecessor(X.tolist(), peaks.rho.tolist())
+    assert peaks.predecessor.tolist() == predecessor
+    np.testing.assert_allclose(peaks.delta, delta, rtol=1e-13)
+    np.testing.assert_array_equal(peaks.gamma, peaks.rho * peaks.delta)
+
+
+@given(X=points, block=blocks, percent=st.floats(0.5, 60), data=st.data())
+def test_labels_and_halo_are_the_definition(X, block, percent, data):
+    peaks = peaks_of(X, block, dc_percent=percent)
+    centers = data.draw(
+        st.integers(1, len(X)).map(lambda n: peaks.centers(n=n).tolist())
+        | st.lists(st.integers(0, len(X) - 1), unique=True)
+    )
+    labels = peaks.labels(centers).tolist()
+    assert labels == reference.labels(peaks.predecessor.tolist(), centers)
+    with mock.patch.object(_density, "_BLOCK", block):
+        halo = peaks.halo(labels).tolist()
+    assert halo == reference.halo(X.tolist(), peaks.rho.tolist(), labels, peaks.dc)
+
+
+@given(X=points, alpha=st.floats(0, 1))
+def test_centers(X, alpha):
+    peaks = density_peaks(X)
+    centers = peaks.centers(alpha=alpha)
+    limit = alpha * (peaks.rho.max() * peaks.delta.max())
+    assert sorted(centers) == np.flatnonzero(peaks.gamma >= limit).tolist()
+    assert peaks.predecessor[centers[0]] == -1
+    assert (np.diff(peaks.gamma[centers]) <= 0).all()
+    assert peaks.centers(n=len(centers)).tolist() == centers.tolist()
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("columns", [1, 2, 4, 20])
+def test_larger_sets_agree_with_the_matrix(kernel, columns):
+    """Through neighbour lists of growing length, with duplicates, and with the usual block size."""
+    rng = np.random.default_rng(columns)
+    X = np.round(rng.normal(0, 3, (1500, columns)), 1)
+    peaks = density_peaks(X, kernel=kernel)
+    D = np.sqrt(np.square(X[:, None] - X).sum(axis=2))
+    rank = np.empty(len(X), dtype=int)
+    rank[np.argsort(-peaks.rho, kind="stable")] = np.arange(len(X))
+    to_denser = np.where(rank[:, None] > rank, D, np.inf)
+    root = np.flatnonzero(peaks.predecessor < 0)
+    assert rank[root].tolist() == [0]
+    to_denser[root] = D[root].max()
+    np.testing.assert_allclose(peaks.delta, to_denser.min(axis=1), rtol=1e-13)
+    weights = np.less(D, peaks.dc) if kernel == "cutoff" else np.exp(-((D / peaks.dc) ** 2))
+    np.fill_diagonal(weights, 0)
+    np.testing.assert_allclose(peaks.rho, weights.sum(axis=1), rtol=1e-10)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_no_matrix_is_held(kernel):
+    X = np.random.default_rng(0).uniform(size=(6000, 4))
+    tracemalloc.start()
+    try:
+        density_peaks(X, dc=0.2, kernel=kernel)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < 6000 * 6000 * 8 / 6
+
+
+@pytest.mark.parametrize("percent", [0.5, 2.0, 10.0])
+def test_sampled_dc_stays_within_its_stated_error(percent):
+    X = np.random.default_rng(1).normal(size=(4001, 4))
+    peaks = density_peaks(X, dc_percent=percent)
+    standard_error = np.sqrt((100 / percent - 1) / 1e6)
+    miss = peaks.rho.mean() / (percent / 100 * len(X)) - 1
+    assert abs(miss) < 4 * standard_error
+    assert density_peaks(X, dc_percent=percent).dc == peaks.dc
+    exact = density_peaks(X[:4000], dc_percent=percent)
+    assert exact.rho.mean() == pytest.approx(percent / 100 * 4000, rel=1e-6)
+
+
+def test_one_and_two_points():
+    one = density_peaks([[3.0, 4.0]])
+    assert (one.rho[0], one.delta[0], one.gamma[0], one.predecessor[0]) == (0, 0, 0, -1)
+    assert one.labels(one.centers(alpha=0.5)).tolist() == [0]
+    two = density_peaks([[0.0, 0.0], [3.0, 4.0]])
+    assert two.rho.tolist() == [1, 1]
+    assert two.delta.tolist() == [5, 5]
+    assert two.predecessor.tolist() == [-1, 0]
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_all_points_equal(kernel):
+    peaks = density_peaks(np.full((1200, 4), 7.0), kernel=kernel)
+    assert peaks.dc > 0
+    assert (peaks.rho == 1199).all()
+    assert (peaks.delta == 0).all()
+    assert peaks.predecessor.tolist() == [-1] + [0] * 1199
+    assert not peaks.halo(peaks.labels(peaks.centers(n=1))).any()
+
+
+def test_clusters_of_known_membership_are_found():
+    rng = np.random.default_rng(2)
+    truth = np.repeat([0, 1, 2], [300, 200, 100])
+    X = rng.normal(size=(600, 4)) + np.array([0.0, 12.0, -15.0])[truth, None]
+    peaks = density_peaks(X)
+    assert peaks.labels(peaks.centers(n=3)).tolist() == truth.tolist()
+
+
+@settings(max_examples=30)
+@given(seed=st.integers(0, 1000))
+def test_row_order_only_renames_the_rows(seed):
+    rng = np.random.default_rng(seed)
+    X = rng.normal(size=(50, 4))
+    order = rng.permutation(50)
+    before, after = density_peaks(X), density_peaks(X[order])
+    assert after.dc == pytest.approx(before.dc, rel=1e-13)
+    np.testing.assert_array_equal(after.rho, before.rho[order])
+
+
+@pytest.mark.parametrize(
+    ("X", "options", "message"),
+    [
+        (np.zeros(4), {}, "two-dimensional"),
+        (np.zeros((0, 4)), {}, "at least one row"),
+        (np.zeros((4, 0)), {}, "one column"),
+        ([[0.0], [np.nan]], {}, "NaN"),
+        ([[0.0], [np.inf]], {}, "infinite"),
+        ([[0.0], [1e200]], {}, "rescale"),
+        ([[0.0], [1.0]], {"dc": 0.0}, "dc is a distance"),
+        ([[0.0], [1.0]], {"dc": np.nan}, "dc is a distance"),
+        ([[0.0], [1.0]], {"dc_percent": 0.0}, "percentage"),
+        ([[0.0], [1.0]], {"dc_percent": 101.0}, "percentage"),
+        ([[0.0], [1.0]], {"kernel": "box"}, "'cutoff' or 'gaussian'"),
+    ],
+)
+def test_wrong_input_is_named(X, options, message):
+    with pytest.raises(ValueError, match=message):
+        density_peaks(X, **options)
+
+
+@pytest.mark.parametrize("options", [{}, {"alpha": 0.1, "n": 2}, {"alpha": 1.1}, {"n": 0}])
+def test_centers_wants_one_rule_in_range(options):
+    with pytest.raises(ValueError, match=r"alpha|n must lie"):
+        density_peaks(np.eye(5)).centers(**options)
+
+
+def test_labels_and_halo_refuse_what_does_not_fit():
+    peaks = density_peaks(np.eye(5))
+    for centers in ([5], [-1], [1, 1]):
+        with pytest.raises(ValueError, match="row numbers"):
+            peaks.labels(centers)
+    with pytest.raises(ValueError, match="shape"):
+        peaks.halo([0, 0])
