@@ -162,11 +162,19 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     ------
     pathlib.Path
         The name to write to, with the suffix of ``path``.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written, with ``path`` as its file name.
     """
     target = Path(os.path.realpath(path))
     temporary = target.with_name(f".{target.stem}-{os.getpid()}{target.suffix}")
     try:
         yield temporary
         os.replace(temporary, target)
+    except OSError as error:
+        # The temporary name would tell the caller nothing.
+        raise OSError(error.errno, f"cannot write: {error.strerror or error}", str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)

@@ -1,0 +1,536 @@
+"""The command line: ``cv-densityf`` and ``python -m cv_densityf``."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NoReturn
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import cv_densityf
+from cv_densityf._density import density_peaks
+from cv_densityf._engine import METHODS, Robust, method_flag
+from cv_densityf._epipolar import Floats, residuals
+from cv_densityf._estimate import Estimate, estimate_fundamental
+from cv_densityf._files import InputError, read_matches, replacing
+from cv_densityf.matching import detect, match_features, match_images, read_image
+
+FOUND, NOT_FOUND, WRONG_USE = 0, 1, 2
+_MIN_MATCHES = 8
+#: More points than this make a decision graph neither clearer nor quickly.
+_MAX_GRAPH_POINTS = 10_000
+#: From about 50,000 points on cv2's own USAC_ACCURATE can end the process (OpenCV 5.0).
+_MAX_PLAIN_ACCURATE = 40_000
+_DEMO_ORDERS = 10
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    arguments : sequence of str, optional
+        By default those the process was started with.
+
+    Returns
+    -------
+    int
+        Exit code: 0 found, 1 no fundamental matrix found, 2 wrong use.
+    """
+    try:
+        options = _parser().parse_args(arguments)
+        code: int = options.run(options)
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:
+        # The reader of our output, such as `head`, has had enough.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FOUND
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename is not None else ""
+        return _complain(f"{where}{error.strerror or error}", WRONG_USE)
+    except (InputError, ImportError) as error:
+        return _complain(str(error), WRONG_USE)
+    except KeyboardInterrupt:
+        return _complain("interrupted", 130)
+
+
+def _complain(message: str, code: int) -> int:
+    print(f"cv-densityf: {message}", file=sys.stderr)
+    return code
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser that complains in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(WRONG_USE, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="cv-densityf",
+        description="Fundamental matrices from the density of matches.",
+        epilog="Exit code: 0 found, 1 no fundamental matrix found, 2 wrong use.",
+    )
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+    _add_match(commands)
+    _add_demo(commands)
+    version = commands.add_parser("version", help="print versions, for a bug report")
+    version.set_defaults(run=_run_version)
+    return parser
+
+
+def _number(
+    kind: Callable[[str], float], accepts: Callable[[float], bool], meaning: str
+) -> Callable[[str], float]:
+    """Make an argparse type that accepts some numbers and names them where it refuses."""
+
+    def parse(text: str) -> float:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = float("nan")
+        if not accepts(value):
+            raise argparse.ArgumentTypeError(f"{text!r} is not {meaning}")
+        return value
+
+    return parse
+
+
+_POSITIVE = _number(float, lambda v: 0 < v < float("inf"), "a positive number")
+_POSITIVE_INT = _number(int, lambda v: 0 < v < 2**31, "a positive whole number")
+_SEED = _number(int, lambda v: 0 <= v < 2**31, "a whole number from 0 to 2147483647")
+_SHARE = _number(float, lambda v: 0 < v < 1, "a number between 0 and 1")
+_RATIO = _number(float, lambda v: 0 < v <= 1, "a number above 0 and up to 1")
+_ALPHA = _number(float, lambda v: 0 <= v <= 1, "a number from 0 to 1")
+
+
+def _output(*suffixes: str) -> Callable[[str], Path]:
+    def parse(text: str) -> Path:
+        path = Path(text)
+        if path.suffix.lower() not in suffixes:
+            raise argparse.ArgumentTypeError(f"{text!r} does not end in {' or '.join(suffixes)}")
+        if not path.parent.is_dir():
+            raise argparse.ArgumentTypeError(f"the folder of {text!r} does not exist")
+        return path
+
+    return parse
+
+
+def _add_match(commands: argparse._SubParsersAction[Any]) -> None:
+    match = commands.add_parser(
+        "match",
+        help="match two images, or take matches from a file, and estimate F",
+        description="Match two images, or take matches from a file, and estimate the fundamental "
+        "matrix F with [x', y', 1] F [x, y, 1]' = 0. Plain cv2's result stands beside it.",
+    )
+    match.add_argument("images", nargs="*", metavar="LEFT RIGHT", help="the two images")
+    match.add_argument(
+        "--points",
+        metavar="FILE",
+        help=".npz with points1 and points2 (n, 2) and optionally scores (n,), or .csv with the "
+        "columns x,y,x',y' and optionally score; instead of images",
+    )
+    estimate = match.add_argument_group("estimate")
+    estimate.add_argument(
+        "--method",
+        choices=METHODS,
+        default="usac_accurate",
+        metavar="NAME",
+        help=f"cv2's method: {', '.join(METHODS)} (%(default)s)",
+    )
+    estimate.add_argument(
+        "--threshold",
+        metavar="PX",
+        type=_POSITIVE,
+        default=1.0,
+        help="for inliers, pixels (%(default)s)",
+    )
+    estimate.add_argument(
+        "--confidence", metavar="P", type=_SHARE, default=0.999, help="(%(default)s)"
+    )
+    estimate.add_argument(
+        "--max-iters", metavar="N", type=_POSITIVE_INT, default=5000, help="(%(default)s)"
+    )
+    estimate.add_argument(
+        "--density",
+        choices=("contrast", "paper", "off"),
+        default="contrast",
+        help="how matches are chosen to draw from (%(default)s)",
+    )
+    estimate.add_argument(
+        "--alpha", metavar="A", type=_ALPHA, default=0.011, help="of --density paper (%(default)s)"
+    )
+    estimate.add_argument("--seed", metavar="N", type=_SEED, default=0, help="(%(default)s)")
+    matching = match.add_argument_group("matching, for images")
+    matching.add_argument(
+        "--ratio",
+        metavar="R",
+        type=_RATIO,
+        help="Lowe's ratio test, such as 0.8 (keep all matches)",
+    )
+    matching.add_argument(
+        "--max-features", metavar="N", type=_POSITIVE_INT, help="per image (8000)"
+    )
+    matching.add_argument(
+        "--max-size",
+        metavar="PX",
+        type=_POSITIVE_INT,
+        help="shrink images to this longer side, pixels (1600)",
+    )
+    output = match.add_argument_group("output")
+    output.add_argument("--json", action="store_true", help="print JSON, and nothing else")
+    output.add_argument(
+        "-o",
+        "--output",
+        type=_output(".npz", ".json"),
+        metavar="OUT",
+        help="write F, mask and matches to OUT.npz or OUT.json",
+    )
+    output.add_argument(
+        "--plot", type=_output(".png"), metavar="OUT.png", help="draw matches and epipolar lines"
+    )
+    match.set_defaults(run=_run_match, error=match.error)
+
+
+def _add_demo(commands: argparse._SubParsersAction[Any]) -> None:
+    demo = commands.add_parser(
+        "demo",
+        help="compare with cv2 on a real pair whose F is known",
+        description="Estimate F of a real pair whose F is known, print its error beside cv2's and "
+        "draw what was done. Needs no network.",
+    )
+    demo.add_argument(
+        "--out", type=Path, default=Path("cv-densityf-demo"), metavar="DIR", help="(%(default)s)"
+    )
+    demo.set_defaults(run=_run_demo)
+
+
+@contextmanager
+def _stage(name: str, timings: dict[str, float]) -> Iterator[None]:
+    """Time a stage in milliseconds, and name it on the terminal as long as it runs."""
+    shown = sys.stderr.isatty()
+    if shown:
+        print(f"{name} ...", end="", file=sys.stderr, flush=True)
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        timings[name] = 1e3 * (time.perf_counter() - start)
+        if shown:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+def _run_match(options: argparse.Namespace) -> int:
+    image_options = ("ratio", "max_features", "max_size")
+    if options.points is None and len(options.images) != 2:
+        options.error("give two images, or --points FILE")
+    if options.points is not None:
+        given = [name for name in image_options if getattr(options, name) is not None]
+        if options.images or given:
+            name = "images" if options.images else f"--{given[0].replace('_', '-')}"
+            options.error(f"--points and {name} exclude each other")
+    if options.plot is not None:
+        from cv_densityf import plotting
+
+        plotting.require_matplotlib()
+
+    timings: dict[str, float] = {}
+    images: tuple[NDArray[Any] | None, NDArray[Any] | None] = (None, None)
+    scores: Floats | None
+    if options.points is not None:
+        with _stage("reading", timings):
+            X, scores = read_matches(options.points)
+    else:
+        with _stage("reading", timings):
+            images = (read_image(options.images[0]), read_image(options.images[1]))
+        limits = {
+            "max_size": options.max_size or 1600,
+            "max_features": options.max_features or 8000,
+        }
+        with _stage("features", timings):
+            features = [detect(image, **limits) for image in images if image is not None]
+        with _stage("matching", timings):
+            matches = match_features(*features, ratio=options.ratio)
+        X, scores = matches.X, matches.scores
+    if len(X) < _MIN_MATCHES:
+        raise InputError(
+            f"{options.points or ' and '.join(options.images)}: {len(X)} matches, a fundamental "
+            f"matrix needs at least {_MIN_MATCHES}"
+        )
+
+    robust = Robust(
+        method_flag(options.method), options.threshold, options.confidence, options.max_iters
+    )
+    with _stage("estimating", timings):
+        estimate = estimate_fundamental(
+            X[:, :2],
+            X[:, 2:],
+            method=options.method,
+            threshold=options.threshold,
+            confidence=options.confidence,
+            max_iters=options.max_iters,
+            density=options.density,
+            alpha=options.alpha,
+            scores=scores,
+            random_state=options.seed,
+        )
+    plain = None
+    if options.method != "usac_accurate" or len(X) <= _MAX_PLAIN_ACCURATE:
+        with _stage("plain cv2", timings):
+            plain = robust.plain(X[:, :2], X[:, 2:])
+    report = {
+        "method": options.method,
+        "threshold": options.threshold,
+        **_report(X, robust, estimate, plain, timings),
+    }
+    print(json.dumps(report, allow_nan=False) if options.json else _for_people(report))
+    if not estimate:
+        return _complain(f"no fundamental matrix found: {estimate.reason}", NOT_FOUND)
+    if options.output is not None:
+        _write(options.output, X, scores, estimate, report)
+    if options.plot is not None:
+        with _stage("drawing", timings):
+            _draw(options.plot, images, X, estimate, options.alpha)
+    return FOUND
+
+
+def _report(
+    X: Floats,
+    robust: Robust,
+    estimate: Estimate,
+    plain: tuple[Floats | None, Any] | None,
+    timings: dict[str, float],
+) -> dict[str, Any]:
+    """Everything `match` says, as JSON can hold it."""
+    return {
+        "F": None if estimate.F is None else estimate.F.tolist(),
+        "reason": estimate.reason,
+        "n_matches": len(X),
+        "n_kept": int(estimate.kept.sum()),
+        "n_inliers": estimate.n_inliers,
+        "median_residual": _median_residual(estimate.F, X[estimate.mask], robust),
+        "engine": estimate.engine,
+        "n_draws": estimate.n_draws,
+        "cv2": None if plain is None else _plain_report(X, robust, *plain),
+        "timings_ms": {
+            **{name: round(value, 3) for name, value in timings.items()},
+            "estimating_stages": {
+                name: round(float(value), 3) for name, value in estimate.timings.items()
+            },
+        },
+        "versions": {"cv-densityf": cv_densityf.__version__, "opencv": cv2.__version__},
+    }
+
+
+def _plain_report(X: Floats, robust: Robust, F: Floats | None, mask: Any) -> dict[str, Any]:
+    inliers = np.zeros(len(X), dtype=bool) if F is None else mask.ravel() > 0
+    return {
+        "F": None if F is None else F.tolist(),
+        "n_inliers": int(inliers.sum()),
+        "median_residual": _median_residual(F, X[inliers], robust),
+    }
+
+
+def _median_residual(F: Floats | None, X: Floats, robust: Robust) -> float | None:
+    if F is None or len(X) == 0 or F.shape != (3, 3):
+        return None
+    median = float(np.median(residuals(F, X, robust.rule)))
+    return median if np.isfinite(median) else None
+
+
+def _for_people(report: dict[str, Any]) -> str:
+    times = report["timings_ms"]
+    ours = [report["n_kept"], *_result(report), f"{times['estimating']:.1f}"]
+    plain = ["-", "not run", "-", "-"]
+    if report["cv2"] is not None:
+        plain = [report["n_matches"], *_result(report["cv2"]), f"{times['plain cv2']:.1f}"]
+    names = ["kept to draw from", "inliers", "median residual, px", "time, ms"]
+    lines = [
+        f"{report['n_matches']} matches, {report['method']}, threshold {report['threshold']:g} px",
+        "",
+        f"{'':<22}{'cv-densityf':>12}{'plain cv2':>12}",
+    ]
+    lines += [f"{name:<22}{a:>12}{b:>12}" for name, a, b in zip(names, ours, plain, strict=True)]
+    stages = {
+        **{name: times[name] for name in ("reading", "features", "matching") if name in times},
+        **times["estimating_stages"],
+    }
+    named = ", ".join(f"{name} {value:.1f}" for name, value in stages.items())
+    lines.append(f"{'stages, ms':<22}  {named}")
+    if report["F"] is not None:
+        lines += ["", "F"]
+        lines += ["  " + "".join(f"{value:>18.9e}" for value in row) for row in report["F"]]
+    return "\n".join(lines)
+
+
+def _result(side: dict[str, Any]) -> tuple[str, str]:
+    if side["F"] is None:
+        return "no F", "-"
+    residual = side["median_residual"]
+    return str(side["n_inliers"]), "-" if residual is None else f"{residual:.3f}"
+
+
+def _write(
+    path: Path, X: Floats, scores: Floats | None, estimate: Estimate, report: dict[str, Any]
+) -> None:
+    arrays: dict[str, Any] = {
+        "points1": X[:, :2],
+        "points2": X[:, 2:],
+        "mask": estimate.mask,
+        "kept": estimate.kept,
+        "reliability": estimate.reliability,
+    }
+    if scores is not None:
+        arrays["scores"] = scores
+    with replacing(path) as temporary:
+        if path.suffix.lower() == ".npz":
+            np.savez(temporary, F=np.asarray(estimate.F), **arrays)
+        else:
+            lists = {name: _finite_or_none(array) for name, array in arrays.items()}
+            text = json.dumps({**report, **lists}, allow_nan=False)
+            temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def _finite_or_none(values: NDArray[Any]) -> list[Any]:
+    """Nested lists in which None stands for what JSON has no number for."""
+    objects = values.astype(object)
+    objects[~np.isfinite(values)] = None
+    return list(objects.tolist())
+
+
+def _draw(
+    path: Path,
+    images: tuple[NDArray[Any] | None, NDArray[Any] | None],
+    X: Floats,
+    estimate: Estimate,
+    alpha: float,
+) -> None:
+    from cv_densityf import plotting
+
+    rows = np.flatnonzero(np.isfinite(X).all(axis=1))
+    rows = rows[:: max(1, -(-len(rows) // _MAX_GRAPH_POINTS))]
+    figure = plotting.summary_figure(
+        *images,
+        X[rows],
+        np.asarray(estimate.F),
+        kept=estimate.kept[rows],
+        mask=estimate.mask[rows],
+        peaks=density_peaks(X[rows]),
+        alpha=alpha,
+    )
+    with replacing(path) as temporary:
+        figure.savefig(temporary)
+
+
+def _run_demo(options: argparse.Namespace) -> int:
+    from cv_densityf import datasets, plotting
+
+    plotting.require_matplotlib()
+    timings: dict[str, float] = {}
+    with _stage("reading", timings):
+        pair = datasets.motorcycle()
+    options.out.mkdir(parents=True, exist_ok=True)
+    with _stage("matching", timings):
+        matches = match_images(pair.image1, pair.image2)
+    X = matches.X
+    print(
+        f"Middlebury's pair 'motorcycle', the second image turned by a known homography:\n"
+        f"{len(X)} SIFT matches, mutual nearest neighbours, no ratio test. Threshold 1 px.\n"
+        f"Error: mean distance of {len(pair.points1)} true correspondences to the epipolar lines,\n"
+        f"over {_DEMO_ORDERS} orders of the matches (cv2's results depend on the order).\n"
+    )
+    print(f"{'':<34}{'error, px':>20}{'inliers':>10}{'time, ms':>10}")
+    print(f"{'':<34}{'median':>10}{'worst':>10}{'median':>10}{'median':>10}")
+    orders = [np.random.default_rng(seed).permutation(len(X)) for seed in range(_DEMO_ORDERS)]
+    for name, estimate in _demo_estimators():
+        with _stage(name, timings):
+            results = []
+            for order in orders:
+                start = time.perf_counter()
+                F, mask = estimate(X[order], matches.scores[order])
+                elapsed = 1e3 * (time.perf_counter() - start)
+                error = float("inf") if F is None else pair.error(F)
+                results.append((error, int(np.sum(mask)), elapsed))
+        errors, inliers, times = np.array(results).T
+        print(
+            f"{name:<34}{np.median(errors):>10.3f}{errors.max():>10.3f}"
+            f"{np.median(inliers):>10.0f}{np.median(times):>10.1f}"
+        )
+    found = estimate_fundamental(matches.points1, matches.points2)
+    if found.F is None:
+        return _complain(f"no fundamental matrix found: {found.reason}", NOT_FOUND)
+    F = found.F
+    with _stage("drawing", timings):
+        images = (pair.image1, pair.image2)
+        peaks = density_peaks(X)
+        drawings: dict[str, tuple[float, Callable[[Any], object]]] = {
+            "matches": (
+                6,
+                lambda ax: plotting.plot_matches(*images, X, found.kept, found.mask, ax=ax),
+            ),
+            "epipolar_lines": (
+                6,
+                lambda ax: plotting.plot_epipolar_lines(*images, X, F, found.mask, ax=ax),
+            ),
+            "decision_graph": (
+                7,
+                lambda ax: plotting.plot_decision_graph(
+                    peaks, kept=found.kept, mask=found.mask, ax=ax
+                ),
+            ),
+        }
+        for name, (height, draw) in drawings.items():
+            figure = plotting.new_figure(16, height)
+            draw(figure.subplots())
+            with replacing(options.out / f"{name}.png") as temporary:
+                figure.savefig(temporary)
+    print(f"\nPlots: {', '.join(f'{options.out / name}.png' for name in drawings)}")
+    return FOUND
+
+
+def _demo_estimators() -> Iterator[tuple[str, Callable[[Floats, Floats], tuple[Any, Any]]]]:
+    """Names and functions of matches and scores that give F and mask."""
+
+    def ours(X: Floats, scores: Floats | None = None) -> tuple[Any, Any]:
+        found = estimate_fundamental(X[:, :2], X[:, 2:], scores=scores)
+        return found.F, found.mask
+
+    yield "cv-densityf", lambda X, scores: ours(X)
+    yield "cv-densityf, with scores", ours
+    for name in ("ransac", "usac_magsac", "usac_accurate"):
+        robust = Robust(method_flag(name), 1.0, 0.999, 5000)
+
+        def plain(X: Floats, scores: Floats, robust: Robust = robust) -> tuple[Any, Any]:
+            F, mask = robust.plain(X[:, :2], X[:, 2:])
+            return F, 0 if mask is None else mask
+
+        yield f"cv2, {name}", plain
+
+
+def _run_version(options: argparse.Namespace) -> int:
+    print(f"cv-densityf {cv_densityf.__version__}")
+    print(f"opencv {cv2.__version__}")
+    for name in ("numpy", "scipy", "scikit-learn", "matplotlib", "scikit-image"):
+        try:
+            print(f"{name} {metadata.version(name)}")
+        except metadata.PackageNotFoundError:
+            print(f"{name} not installed")
+    print(f"python {platform.python_version()} on {platform.platform()}")
+    return FOUND
+
+
+if __name__ == "__main__":
+    sys.exit(main())
