@@ -198,9 +198,9 @@ def _true_matches(
 def motorcycle() -> ImagePair:
     """Load the Middlebury stereo pair "motorcycle", with the second image turned.
 
-    The pair is rectified; the second image is turned here by a known homography, so that its
-    fundamental matrix is a general one and still known (to a tenth of a pixel, the accuracy of
-    Middlebury's own rectification). The images and their disparity are those
+    The pair is rectified; the second image is turned here by a known homography, so that epipolar
+    lines are no longer rows and the fundamental matrix is still known (to a tenth of a pixel, the
+    accuracy of Middlebury's own rectification). The images and their disparity are those
     in the wheel of scikit-image; nothing is downloaded.
 
     Returns
