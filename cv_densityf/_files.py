@@ -64,21 +64,19 @@ def read_matches(
 
 
 def _read_npz(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    try:
-        archive = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, zipfile.BadZipFile):
-        raise InputError("not a NumPy .npz archive") from None
-    if not isinstance(archive, np.lib.npyio.NpzFile):
-        raise InputError("a single array; save points1 and points2 with numpy.savez")
-    with archive:
-        for names in _POINT_KEYS:
-            if all(name in archive for name in names):
-                points1, points2 = (_numbers(archive, name) for name in names)
-                break
-        else:
+    with path.open("rb") as stream:
+        try:
+            archive = np.load(stream, allow_pickle=False)
+        except (ValueError, EOFError, zipfile.BadZipFile):
+            raise InputError("not a NumPy .npz archive") from None
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise InputError("a single array; save points1 and points2 with numpy.savez")
+        names = next((pair for pair in _POINT_KEYS if set(pair) <= set(archive.files)), None)
+        if names is None:
             found = ", ".join(archive.files) or "nothing"
             raise InputError(f"needs the arrays points1 and points2; it holds {found}")
-        score_key = next((key for key in _SCORE_KEYS if key in archive), None)
+        points1, points2 = (_numbers(archive, name) for name in names)
+        score_key = next((key for key in _SCORE_KEYS if key in archive.files), None)
         scores = None if score_key is None else _numbers(archive, score_key)
     for name, points in zip(names, (points1, points2), strict=True):
         if points.ndim != 2 or points.shape[1] != 2:

@@ -112,7 +112,9 @@ class TestMotorcycle:
         F = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
         points = np.random.default_rng(0).uniform(0, 100, (20, 2))
         image = np.zeros((1, 1, 3), np.uint8)
-        assert ImagePair(image, image, F, points, points + (7, 3)).error(5 * F) == pytest.approx(3)
+        moved = points + np.array([7, 3])
+        pair = ImagePair(image, image, F, points, moved)
+        assert pair.error(5 * F) == pytest.approx(3)
 
     def test_without_scikit_image(self, monkeypatch):
         monkeypatch.setattr(datasets, "find_spec", lambda name: None)
