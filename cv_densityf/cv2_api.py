@@ -29,6 +29,9 @@ _GRAPH_CUT_MAX = 40_000
 #: Below this threshold cv2's MAGSAC raises whatever the points are.
 _MAGSAC_MIN_THRESHOLD = 1e-3
 
+#: No image is this wide: every match is an inlier, and there is nothing to estimate.
+_MAX_THRESHOLD = 1e6
+
 
 @overload
 def findFundamentalMat(
@@ -316,7 +319,7 @@ def _is_ordinary(call: Call) -> bool:
         magsac = params.score == cv2.SCORE_METHOD_MAGSAC
     lowest = _MAGSAC_MIN_THRESHOLD if magsac else 0.0
     return (
-        (lowest < call.threshold < math.inf or call.method == cv2.FM_LMEDS)
+        (lowest < call.threshold < _MAX_THRESHOLD or call.method == cv2.FM_LMEDS)
         and 0.0 < call.confidence < 1.0
         and call.max_iters > 0
     )
