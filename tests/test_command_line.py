@@ -1,0 +1,351 @@
+from __future__ import annotations
+
+import errno
+import json
+import re
+import socket
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+import cv_densityf
+from cv_densityf.__main__ import main
+from cv_densityf._epipolar import inlier_mask, residuals, sampson_distance
+from cv_densityf._estimate import estimate_fundamental
+from cv_densityf.datasets import motorcycle, two_view_scene
+
+SCENE = two_view_scene(400, inlier_ratio=0.5)
+
+
+@pytest.fixture
+def npz(tmp_path):
+    path = tmp_path / "matches.npz"
+    np.savez(path, points1=SCENE.points1, points2=SCENE.points2)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    pair, folder = motorcycle(), tmp_path_factory.mktemp("photos")
+    paths = [str(folder / name) for name in ("left.png", "right.png")]
+    for path, image in zip(paths, (pair.image1, pair.image2), strict=True):
+        cv2.imwrite(path, image)
+    return paths
+
+
+@pytest.fixture
+def run(capfd):
+    """Run the command line; exit code, standard output, standard error."""
+
+    def run(*arguments):
+        try:
+            code = main([str(argument) for argument in arguments])
+        except SystemExit as stop:
+            code = stop.code
+        return (code, *capfd.readouterr())
+
+    return run
+
+
+def test_points_to_json(run, npz):
+    code, out, err = run("match", "--points", npz, "--json")
+    report = json.loads(out)
+    assert (code, err) == (0, "")
+    F = np.array(report["F"])
+    assert np.median(sampson_distance(F, SCENE.X[SCENE.inliers])) < 1
+    mask = inlier_mask(F, SCENE.X, "usac", 1.0)
+    assert report["n_matches"] == 400
+    assert report["n_inliers"] == mask.sum()
+    assert report["median_residual"] == pytest.approx(
+        np.median(residuals(F, SCENE.X[mask], "usac"))
+    )
+
+
+def test_plain_cv2_stands_beside_it(run, npz):
+    _, out, _ = run("match", "--points", npz, "--json", "--method", "ransac", "--threshold", "2")
+    F, mask = cv2.findFundamentalMat(SCENE.points1, SCENE.points2, cv2.FM_RANSAC, 2.0, 0.999, 5000)
+    plain = json.loads(out)["cv2"]
+    np.testing.assert_array_equal(plain["F"], F)
+    assert plain["n_inliers"] == mask.sum()
+    expected = np.median(residuals(F, SCENE.X[mask.ravel() > 0], "ransac"))
+    assert plain["median_residual"] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"method": "ransac", "threshold": 3.0, "confidence": 0.9, "max_iters": 50},
+        {"density": "paper", "alpha": 0.05},
+        {"density": "off", "method": "lmeds"},
+        {"random_state": 7},
+    ],
+)
+def test_options_reach_the_estimate(run, npz, options):
+    flags = []
+    for name, value in options.items():
+        flags += [f"--{name.replace('_', '-').replace('random-state', 'seed')}", value]
+    code, out, _ = run("match", "--points", npz, "--json", *flags)
+    expected = estimate_fundamental(SCENE.points1, SCENE.points2, **options)
+    report = json.loads(out)
+    assert code == 0
+    np.testing.assert_array_equal(report["F"], expected.F)
+    assert report["n_kept"] == expected.kept.sum()
+    assert report["n_draws"] == expected.n_draws
+
+
+def test_scores_reach_the_estimate(run, tmp_path, monkeypatch):
+    scores = np.random.default_rng(0).uniform(size=400)
+    path = tmp_path / "matches.npz"
+    np.savez(path, points1=SCENE.points1, points2=SCENE.points2, scores=scores)
+    seen = []
+
+    def spy(*arguments, **options):
+        seen.append(options["scores"])
+        return estimate_fundamental(*arguments, **options)
+
+    monkeypatch.setattr("cv_densityf.__main__.estimate_fundamental", spy)
+    assert run("match", "--points", path)[0] == 0
+    np.testing.assert_array_equal(seen[0], scores)
+
+
+def test_csv_and_npz_say_the_same(run, npz, tmp_path):
+    path = tmp_path / "matches.csv"
+    np.savetxt(path, SCENE.X, delimiter=",", header="x,y,x',y'", comments="", fmt="%.17g")
+    results = [json.loads(run("match", "--points", p, "--json")[1]) for p in (npz, path)]
+    assert results[0]["F"] == results[1]["F"]
+
+
+def test_people_read_the_same_numbers(run, npz):
+    _, out, _ = run("match", "--points", npz, "--json")
+    report = json.loads(out)
+    code, text, err = run("match", "--points", npz)
+    assert (code, err) == (0, "")
+    assert text.startswith("400 matches, usac_accurate, threshold 1 px\n")
+    for line, ours, plain in (
+        ("kept to draw from", report["n_kept"], 400),
+        ("inliers", report["n_inliers"], report["cv2"]["n_inliers"]),
+        (
+            "median residual, px",
+            f"{report['median_residual']:.3f}",
+            f"{report['cv2']['median_residual']:.3f}",
+        ),
+    ):
+        assert re.search(rf"^{line} +{ours} +{plain}$", text, re.MULTILINE)
+    assert re.search(r"^time, ms +[\d.]+ +[\d.]+$", text, re.MULTILINE)
+    numbers = [float(word) for word in text.split("\nF\n")[1].split()]
+    np.testing.assert_allclose(numbers, np.ravel(report["F"]), rtol=1e-8)
+
+
+def test_output_npz_can_be_read_back(run, npz, tmp_path):
+    path = tmp_path / "out.npz"
+    code, out, _ = run("match", "--points", npz, "--json", "-o", path)
+    assert code == 0
+    with np.load(path, allow_pickle=False) as found:
+        np.testing.assert_array_equal(found["points1"], SCENE.points1)
+        np.testing.assert_array_equal(found["F"], json.loads(out)["F"])
+        np.testing.assert_array_equal(found["mask"], inlier_mask(found["F"], SCENE.X, "usac", 1.0))
+        assert found["kept"].shape == found["reliability"].shape == (400,)
+    again = json.loads(run("match", "--points", path, "--json")[1])
+    assert again["F"] == json.loads(out)["F"]
+
+
+def test_output_json_holds_the_matches_too(run, tmp_path):
+    # JSON knows no NaN; a strict reader would stumble.
+    points1 = SCENE.points1.copy()
+    points1[3] = np.nan
+    np.savez(tmp_path / "in.npz", points1=points1, points2=SCENE.points2)
+    path = tmp_path / "out.json"
+    code, out, _ = run("match", "--points", tmp_path / "in.npz", "--json", "--output", path)
+    assert code == 0
+    found = json.loads(path.read_text(), parse_constant=pytest.fail)
+    assert {name: found[name] for name in json.loads(out)} == json.loads(out)
+    assert found["points1"][3] == [None, None]
+    assert found["points1"][4] == points1[4].tolist()
+    assert found["mask"][3] is False
+    assert sum(found["mask"]) == found["n_inliers"]
+
+
+def test_two_images(run, photos, tmp_path):
+    plot = tmp_path / "plot.png"
+    code, out, err = run("match", *photos, "--json", "--plot", plot, "-o", tmp_path / "out.npz")
+    assert (code, err) == (0, "")
+    report = json.loads(out)
+    assert motorcycle().error(np.array(report["F"])) < 0.5
+    assert {"reading", "features", "matching", "estimating"} <= set(report["timings_ms"])
+    assert cv2.imread(str(plot)).shape[1] == 1600
+    with np.load(tmp_path / "out.npz") as found:
+        assert found["scores"].shape == (report["n_matches"],)
+
+
+def test_matching_options(run, photos):
+    def n_matches(*options):
+        return json.loads(run("match", *photos, "--json", *options)[1])["n_matches"]
+
+    everything = n_matches()
+    assert 8 <= n_matches("--max-features", 200) <= 200
+    assert n_matches("--ratio", 0.7) < everything
+    assert n_matches("--max-size", 300) < everything
+
+
+def test_points_can_be_drawn_without_images(run, npz, tmp_path):
+    assert run("match", "--points", npz, "--plot", tmp_path / "plot.png")[0] == 0
+    assert cv2.imread(str(tmp_path / "plot.png")).shape[1] == 1600
+
+
+def test_stages_are_shown_on_a_terminal_only(run, npz, monkeypatch):
+    assert run("match", "--points", npz)[2] == ""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    _, out, err = run("match", "--points", npz, "--json")
+    json.loads(out)
+    assert "estimating ..." in err
+
+
+class TestNoF:
+    @pytest.fixture
+    def constant(self, tmp_path):
+        path = tmp_path / "same.npz"
+        np.savez(path, points1=np.ones((30, 2)), points2=np.ones((30, 2)))
+        return path
+
+    def test_exit_code_and_reason(self, run, constant):
+        code, out, err = run("match", "--points", constant)
+        assert code == 1
+        assert "no F" in out
+        assert re.fullmatch(r"cv-densityf: no fundamental matrix found: .+\n", err)
+
+    def test_json_says_so(self, run, constant):
+        code, out, _ = run("match", "--points", constant, "--json")
+        assert code == 1
+        assert json.loads(out)["F"] is None
+        assert json.loads(out)["reason"]
+
+    def test_nothing_is_written(self, run, constant, tmp_path):
+        run("match", "--points", constant, "-o", tmp_path / "o.npz", "--plot", tmp_path / "p.png")
+        assert [path.name for path in tmp_path.iterdir()] == ["same.npz"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "COMMAND"),
+        (["guess"], "invalid choice: 'guess'"),
+        (["match"], "give two images, or --points FILE"),
+        (["match", "one.png"], "give two images"),
+        (["match", "a.png", "b.png", "c.png"], "give two images"),
+        (["match", "{here}/no.png", "{here}/no.png"], "no.png: No such file"),
+        (["match", "{here}", "{here}"], "Is a directory"),
+        (["match", "{here}/text.csv", "{here}/text.csv"], "text.csv: not an image"),
+        (["match", "{here}/black.png", "{here}/black.png"], "black.png: 0 matches, .* at least 8"),
+        (["match", "--points", "{here}/no.npz"], "no.npz: No such file"),
+        (["match", "--points", "{here}/text.csv"], "text.csv: header 'hello' is not"),
+        (["match", "--points", "{here}/seven.csv"], "seven.csv: 7 matches, .* at least 8"),
+        (["match", "--points", "{npz}", "a.png", "b.png"], "--points and images exclude"),
+        (["match", "--points", "{npz}", "--ratio", "0.8"], "--points and --ratio exclude"),
+        (["match", "--points", "{npz}", "--max-size", "9"], "--points and --max-size exclude"),
+        (["match", "--points", "{npz}", "--method", "guess"], "--method: invalid choice: 'guess'"),
+        (["match", "--points", "{npz}", "--density", "high"], "--density: invalid choice"),
+        (["match", "--points", "{npz}", "--threshold", "0"], "--threshold: '0' is not a positive"),
+        (["match", "--points", "{npz}", "--threshold", "nan"], "--threshold: 'nan' is not"),
+        (["match", "--points", "{npz}", "--confidence", "1"], "--confidence: '1' is not"),
+        (["match", "--points", "{npz}", "--max-iters", "0"], "--max-iters: '0' is not"),
+        (["match", "--points", "{npz}", "--max-iters", "9e9"], "--max-iters: '9e9' is not"),
+        (["match", "--points", "{npz}", "--alpha", "-1"], "--alpha: '-1' is not"),
+        (["match", "--points", "{npz}", "--seed", "1.5"], "--seed: '1.5' is not a whole"),
+        (["match", "a.png", "b.png", "--ratio", "2"], "--ratio: '2' is not"),
+        (["match", "--points", "{npz}", "-o", "out.txt"], "'out.txt' does not end in .npz or"),
+        (["match", "--points", "{npz}", "-o", "{here}/no/out.npz"], "folder of .* does not exist"),
+        (["match", "--points", "{npz}", "--plot", "out.jpg"], "'out.jpg' does not end in .png"),
+        (["demo", "--out", "{npz}"], "File exists"),
+    ],
+)
+def test_wrong_use(run, npz, tmp_path, arguments, message):
+    (tmp_path / "text.csv").write_text("hello\n")
+    np.savetxt(tmp_path / "seven.csv", SCENE.X[:7], delimiter=",")
+    cv2.imwrite(str(tmp_path / "black.png"), np.zeros((50, 60), np.uint8))
+    before = {path.name for path in tmp_path.iterdir()}
+    code, out, err = run(*(text.format(here=tmp_path, npz=npz) for text in arguments))
+    assert (code, out) == (2, "")
+    assert err.startswith("cv-densityf")
+    assert err.count("\n") == 1
+    assert re.search(message, err)
+    assert {path.name for path in tmp_path.iterdir()} == before
+
+
+def test_full_disk_leaves_no_half_file(run, npz, tmp_path, monkeypatch):
+    def full(path, **arrays):
+        path.write_bytes(b"half")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    code, _, err = run("match", "--points", npz, "-o", tmp_path / "out.npz")
+    assert code == 2
+    assert err.endswith("out.npz: cannot write: No space left on device\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["matches.npz"]
+
+
+def test_without_matplotlib_it_says_so_before_it_works(run, npz, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    code, out, err = run("match", "--points", npz, "--plot", tmp_path / "plot.png")
+    assert (code, out) == (2, "")
+    assert "pip install matplotlib" in err
+
+
+def test_more_matches_than_cv2_survives(run, tmp_path):
+    scene = two_view_scene(60_000)
+    path = tmp_path / "many.npz"
+    np.savez(path, points1=scene.points1, points2=scene.points2)
+    code, out, _ = run("match", "--points", path)
+    assert code == 0
+    assert "not run" in out
+
+
+def test_demo_needs_no_network(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(socket, "socket", lambda *arguments: pytest.fail("opened a socket"))
+    monkeypatch.setattr("cv_densityf.__main__._DEMO_ORDERS", 2)
+    code, out, err = run("demo", "--out", tmp_path / "new" / "folder")
+    assert (code, err) == (0, "")
+    errors = dict(re.findall(r"^(c.+?) {2,}([\d.]+) ", out, re.MULTILINE))
+    assert set(errors) == {
+        "cv-densityf",
+        "cv-densityf, with scores",
+        "cv2, ransac",
+        "cv2, usac_magsac",
+        "cv2, usac_accurate",
+    }
+    assert all(0 < float(error) < 2 for error in errors.values())
+    assert float(errors["cv-densityf"]) < 0.3
+    for name in ("matches", "epipolar_lines", "decision_graph"):
+        path = tmp_path / "new" / "folder" / f"{name}.png"
+        assert str(path) in out
+        assert cv2.imread(str(path)).shape[1] == 1600
+
+
+def test_version(run):
+    code, out, _ = run("version")
+    assert code == 0
+    assert f"cv-densityf {cv_densityf.__version__}\n" in out
+    assert f"opencv {cv2.__version__}\n" in out
+
+
+def test_interrupt_leaves_no_traceback(run, npz, monkeypatch):
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("cv_densityf.__main__.read_matches", interrupted)
+    assert run("match", "--points", npz) == (130, "", "cv-densityf: interrupted\n")
+
+
+def test_as_a_module_with_a_reader_that_leaves():
+    process = subprocess.Popen(
+        [sys.executable, "-m", "cv_densityf", "version"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    process.stdout.close()
+    _, err = process.communicate(timeout=60)
+    assert err == b""
+    assert process.returncode == 0

@@ -1,0 +1,264 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from cv_densityf.datasets import two_view_scene
+from cv_densityf.plotting import (
+    new_figure,
+    plot_decision_graph,
+    plot_epipolar_lines,
+    plot_matches,
+    summary_figure,
+)
+
+SCENE = two_view_scene(60, inlier_ratio=0.5, noise=0)
+PEAKS = SimpleNamespace(
+    rho=np.array([9.0, 5.0, 1.0, 0.0, 8.0]), delta=np.array([80.0, 3.0, 40.0, 70.0, 0.0])
+)
+IMAGE = np.random.default_rng(0).integers(0, 255, (960, 1280), dtype=np.uint8)
+
+
+@pytest.fixture
+def ax():
+    return Figure().subplots()
+
+
+@pytest.fixture(autouse=True)
+def no_display(monkeypatch):
+    mpl.use("agg")
+    yield
+    import matplotlib.pyplot as plt
+
+    plt.close("all")
+
+
+def drawn(ax):
+    """Number of points of each labelled set in the axes."""
+    return {
+        line.get_label(): len(line.get_xdata())
+        for line in ax.lines
+        if not line.get_label().startswith("_")
+    }
+
+
+def legend(ax):
+    return [text.get_text() for text in ax.get_legend().get_texts()]
+
+
+class TestDecisionGraph:
+    def test_classes(self, ax):
+        kept = [True, True, False, False, True]
+        mask = [True, False, True, False, True]
+        assert plot_decision_graph(PEAKS, kept=kept, mask=mask, ax=ax) is ax
+        sets = {line.get_label(): line.get_xydata().tolist() for line in ax.lines}
+        assert sets["kept, inlier (2)"] == [[9, 80], [8, 0]]
+        assert sets["kept, not an inlier (1)"] == [[5, 3]]
+        assert sets["dropped, yet inlier (1)"] == [[1, 40]]
+        assert sets["dropped (1)"] == [[0, 70]]
+        assert set(legend(ax)) == set(sets)
+
+    def test_curve(self, ax):
+        plot_decision_graph(PEAKS, alpha=0.05, ax=ax)
+        (curve,) = (line for line in ax.lines if "0.05" in line.get_label())
+        x, y = curve.get_data()
+        np.testing.assert_allclose(x * y, 0.05 * 9 * 80)
+        assert x.max() >= 9
+        assert y.max() >= 80
+
+    def test_curve_parts_kept_from_dropped_by_default(self, ax):
+        plot_decision_graph(PEAKS, alpha=0.05, ax=ax)
+        product = PEAKS.rho * PEAKS.delta
+        kept = int(np.sum(product >= 0.05 * 9 * 80))
+        assert drawn(ax)[f"kept ({kept})"] == kept
+        assert drawn(ax)[f"dropped ({5 - kept})"] == 5 - kept
+
+    def test_every_point_is_in_view(self, ax):
+        plot_decision_graph(PEAKS, ax=ax)
+        (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+        assert left < PEAKS.rho.min()
+        assert right > PEAKS.rho.max()
+        assert bottom < PEAKS.delta.min()
+        assert top > PEAKS.delta.max()
+
+    @pytest.mark.parametrize("n", [0, 1, 4])
+    def test_nothing_to_tell(self, ax, n):
+        plot_decision_graph(SimpleNamespace(rho=np.zeros(n), delta=np.zeros(n)), ax=ax)
+        ax.figure.canvas.draw()
+
+    @pytest.mark.parametrize("name", ["kept", "mask"])
+    def test_lengths(self, ax, name):
+        with pytest.raises(ValueError, match=name):
+            plot_decision_graph(PEAKS, **{name: [True]}, ax=ax)
+
+
+class TestMatches:
+    def test_classes(self, ax):
+        kept = np.arange(60) < 40
+        plot_matches(IMAGE, IMAGE, SCENE.X, kept, SCENE.inliers, ax=ax)
+        sets = drawn(ax)
+        for label, rows in {
+            "kept, inlier": kept & SCENE.inliers,
+            "kept, not an inlier": kept & ~SCENE.inliers,
+            "dropped, yet inlier": ~kept & SCENE.inliers,
+            "dropped": ~kept & ~SCENE.inliers,
+        }.items():
+            # Each match has a point in both images.
+            assert sets[f"{label} ({rows.sum()})"] == 2 * rows.sum()
+        assert set(legend(ax)) == set(sets)
+
+    def test_points_lie_on_their_images(self, ax):
+        plot_matches(IMAGE, IMAGE[:500, :700], SCENE.X, ax=ax)
+        shown = np.vstack([line.get_xydata() for line in ax.lines if "kept" in line.get_label()])
+        first, second = ax.images
+        (left, right, bottom, top) = second.get_extent()
+        # The first image keeps its pixel coordinates up to half a pixel, the second is moved.
+        np.testing.assert_allclose(shown[:60], SCENE.points1 + 0.5)
+        np.testing.assert_allclose(shown[60:], SCENE.points2 + np.array([left, top]) + 0.5)
+        assert first.get_extent()[1] < left
+        assert (right - left, bottom - top) == (700, 500)
+
+    def test_lines_join_the_points(self, ax):
+        plot_matches(IMAGE, IMAGE, SCENE.X, max_lines=20, ax=ax)
+        (lines,) = ax.collections
+        shown = np.vstack([line.get_xydata() for line in ax.lines if "kept" in line.get_label()])
+        expected = np.stack([shown[:60:3], shown[60::3]], axis=1)
+        np.testing.assert_allclose(np.array(lines.get_segments()), expected)
+
+    def test_images_need_not_be_given(self, ax):
+        plot_matches(None, None, SCENE.X, ax=ax)
+        assert drawn(ax) == {"kept (60)": 120}
+        shown = next(line for line in ax.lines if "kept" in line.get_label()).get_xydata()
+        (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+        assert left < shown[:, 0].min()
+        assert shown[:, 0].max() < right
+        assert top < shown[:, 1].min()
+        assert shown[:, 1].max() < bottom
+
+    def test_rows_that_are_not_finite_are_left_out(self, ax):
+        X = SCENE.X
+        X[3, 0], X[7, 3] = np.nan, np.inf
+        plot_matches(None, None, X, mask=SCENE.inliers, ax=ax)
+        assert sum(drawn(ax).values()) == 2 * 58
+
+    @pytest.mark.parametrize(
+        "image", [IMAGE / 255, IMAGE.astype(np.uint16), np.dstack([IMAGE] * 4)]
+    )
+    def test_kinds_of_images(self, ax, image):
+        plot_matches(image, IMAGE, SCENE.X, ax=ax)
+        assert len(ax.images) == 2
+
+    @pytest.mark.parametrize("n", [0, 1])
+    def test_few(self, ax, n):
+        plot_matches(None, None, SCENE.X[:n], ax=ax)
+        ax.figure.canvas.draw()
+
+    def test_shapes(self, ax):
+        with pytest.raises(ValueError, match=r"X must have the shape \(n, 4\)"):
+            plot_matches(None, None, SCENE.points1, ax=ax)
+        with pytest.raises(ValueError, match="mask"):
+            plot_matches(None, None, SCENE.X, mask=[True], ax=ax)
+
+
+class TestEpipolarLines:
+    def line_and_points(self, ax):
+        """Drawn segments (m, 2, 2) without their dark borders, and drawn points (m, 2)."""
+        segments = [line.get_xydata() for line in ax.lines if line.get_linewidth() == 1.8]
+        points = [line.get_xydata()[0] for line in ax.lines if line.get_marker() == "o"]
+        return np.array(segments), np.array(points)
+
+    def test_lines_pass_through_the_points_of_exact_matches(self, ax):
+        plot_epipolar_lines(IMAGE, IMAGE, SCENE.X, SCENE.F, SCENE.inliers, n_lines=6, ax=ax)
+        segments, points = self.line_and_points(ax)
+        assert len(segments) == len(points) == 12
+        direction = segments[:, 1] - segments[:, 0]
+        offset = points - segments[:, 0]
+        cross = direction[:, 0] * offset[:, 1] - direction[:, 1] * offset[:, 0]
+        assert np.abs(cross / np.linalg.norm(direction, axis=1)).max() < 1e-6
+
+    def test_lines_end_at_the_borders(self, ax):
+        plot_epipolar_lines(IMAGE, IMAGE, SCENE.X, SCENE.F, SCENE.inliers, ax=ax)
+        segments, _ = self.line_and_points(ax)
+        for image, ends in zip(ax.images, (segments[::2], segments[1::2]), strict=True):
+            left, right, bottom, top = image.get_extent()
+            x, y = ends.reshape(-1, 2).T
+            border = np.min(np.abs([x - left, x - right, y - top, y - bottom]), axis=0)
+            assert border.max() < 1e-6
+            assert x.min() > left - 1e-6
+            assert x.max() < right + 1e-6
+            assert y.min() > top - 1e-6
+            assert y.max() < bottom + 1e-6
+
+    def test_only_inliers_are_drawn(self, ax):
+        mask = np.zeros(60, bool)
+        mask[[5, 17]] = True
+        plot_epipolar_lines(IMAGE, IMAGE, SCENE.X, SCENE.F, mask, ax=ax)
+        _, points = self.line_and_points(ax)
+        assert sorted(points[::2].tolist()) == sorted((SCENE.points1[mask] + 0.5).tolist())
+        assert sorted(text.get_text() for text in ax.texts) == ["1", "1", "2", "2"]
+
+    def test_lines_outside_the_image_are_left_out(self, ax):
+        # Rows of a rectified pair; the second match lies far above the images.
+        F = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+        X = np.array([[10.0, 20, 30, 20], [10, -500, 30, -500]])
+        plot_epipolar_lines(IMAGE, IMAGE, X, F, ax=ax)
+        segments, _ = self.line_and_points(ax)
+        assert len(segments) == 2
+        np.testing.assert_allclose(segments[:, :, 1], 20.5)
+
+    @pytest.mark.parametrize("n", [0, 1])
+    def test_few(self, ax, n):
+        plot_epipolar_lines(None, None, SCENE.X[:n], SCENE.F, ax=ax)
+        ax.figure.canvas.draw()
+
+    def test_shape_of_F(self, ax):
+        with pytest.raises(ValueError, match=r"F must have the shape \(3, 3\)"):
+            plot_epipolar_lines(None, None, SCENE.X, np.zeros((9, 3)), ax=ax)
+
+
+def test_summary_is_1600_pixels_wide(tmp_path):
+    peaks = SimpleNamespace(rho=np.arange(60.0), delta=np.linspace(9, 1, 60))
+    figure = summary_figure(
+        None, None, SCENE.X, SCENE.F, kept=SCENE.inliers, mask=SCENE.inliers, peaks=peaks
+    )
+    figure.savefig(tmp_path / "summary.png")
+    from matplotlib.image import imread
+
+    image = imread(tmp_path / "summary.png")
+    assert image.shape[1] == 1600
+    assert image.std() > 0.05
+
+
+def test_axes_are_made_where_none_are_given():
+    axes = [
+        plot_decision_graph(PEAKS),
+        plot_matches(None, None, SCENE.X),
+        plot_epipolar_lines(None, None, SCENE.X, SCENE.F),
+    ]
+    assert len({id(ax.figure) for ax in axes}) == 3
+
+
+def test_new_figures_are_not_pyplots():
+    import matplotlib.pyplot as plt
+
+    new_figure(4, 3)
+    assert plt.get_fignums() == []
+
+
+def test_matplotlib_is_imported_only_to_draw():
+    code = "import cv_densityf.plotting, sys; print('matplotlib' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+@pytest.mark.parametrize("draw", [lambda: plot_decision_graph(PEAKS), lambda: new_figure(1, 1)])
+def test_without_matplotlib(monkeypatch, draw):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(ImportError, match="pip install matplotlib"):
+        draw()
