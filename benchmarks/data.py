@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -146,9 +147,9 @@ def _load(path: Path, limit: float | None, seed: int) -> Pair | None:
     )
 
 
-def _truth(group: str, X: Floats, d: dict[str, NDArray]) -> Floats:
+def _truth(group: str, X: Floats, d: dict[str, NDArray[Any]]) -> Floats:
     if group.startswith(LABELLED):
-        return X[d["labels"]]
+        return np.asarray(X[d["labels"]])
     if "F_gt" not in d:
         return np.hstack([d["val1"], d["val2"]]).astype(np.float64)
     F = d["F_gt"]
@@ -159,10 +160,10 @@ def move_onto(F: Floats, X: Floats) -> Floats:
     """Move each match the shortest way onto the epipolar geometry of F; (m, 4), m <= n."""
     points1, points2 = cv2.correctMatches(F, X[None, :, :2], X[None, :, 2:])
     moved = np.hstack([points1[0], points2[0]])
-    return moved[np.isfinite(moved).all(axis=1)]
+    return np.asarray(moved[np.isfinite(moved).all(axis=1)], dtype=np.float64)
 
 
-def _cameras(d: dict[str, NDArray]) -> Cameras | None:
+def _cameras(d: dict[str, NDArray[Any]]) -> Cameras | None:
     if not {"K1", "K2", "R", "t"} <= d.keys():
         return None
     if np.linalg.norm(d["t"]) < NO_BASELINE:

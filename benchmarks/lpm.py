@@ -2,8 +2,9 @@
 
 Ma, Zhao, Jiang, Zhou, Guo: Locality preserving matching, IJCV 127 (2019) 512-531, written from the
 paper. A true match keeps its neighbours: those in image 1 are its neighbours in image 2 too, and
-they move alike. The cost of a match is the share of neighbours that it loses or that move otherwise,
-averaged over a few neighbourhood sizes; a second round takes neighbours among the first's survivors.
+they move alike. The cost of a match is the share of neighbours that it loses or that move
+otherwise, averaged over a few neighbourhood sizes; a second round takes neighbours among the
+first's survivors.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ def _cost(X: NDArray[np.float64], among: NDArray[np.bool_]) -> NDArray[np.float6
     alike = _alike(motion, length, near1)
     shared = near1[:, :, None] == near2[:, None, :]
     kept = [(shared[:, :k, :k].any(axis=2) & alike[:, :k]).mean(axis=1) for k in SIZES]
-    return 1.0 - np.mean(kept, axis=0)
+    return np.asarray(1.0 - np.mean(kept, axis=0))
 
 
 def _neighbours(points: NDArray[np.float64], among: NDArray[np.bool_]) -> NDArray[np.intp]:
@@ -61,4 +62,4 @@ def _alike(
     # Cosine times the shorter over the longer length: the inner product over the longer squared.
     with np.errstate(divide="ignore", invalid="ignore"):
         value = np.einsum("ij,ikj->ik", motion, motion[near]) / longer**2
-    return (value >= MIN_ALIKE) | (longer == 0)
+    return np.asarray((value >= MIN_ALIKE) | (longer == 0))

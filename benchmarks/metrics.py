@@ -106,7 +106,7 @@ def pose_error(
     ray1 = np.hstack([truth[:, :2], one]) @ np.linalg.inv(K1).T
     ray2 = np.hstack([truth[:, 2:], one]) @ np.linalg.inv(K2).T
     poses = [(U @ w @ Vt, sign * U[:, 2]) for w in (W, W.T) for sign in (1.0, -1.0)]
-    best_R, best_t = max(poses, key=lambda pose: _n_in_front(*pose, ray1, ray2))
+    best_R, best_t = max(poses, key=lambda pose: _n_in_front(pose[0], pose[1], ray1, ray2))
     cos_R = np.clip((np.trace(R.T @ best_R) - 1) / 2, -1, 1)
     cos_t = np.clip(t @ best_t / np.linalg.norm(t), -1, 1)
     return float(np.degrees(max(np.arccos(cos_R), np.arccos(cos_t))))
@@ -177,13 +177,13 @@ def summarise(
     return row
 
 
-def wins_and_losses(ours: Floats, theirs: Floats) -> tuple[int, int]:
+def wins_and_losses(ours: ArrayLike, theirs: ArrayLike) -> tuple[int, int]:
     """On how many pairs ``ours`` is clearly smaller, and on how many clearly larger.
 
     Clearly: by more than 2 % of the smaller error; failures on both sides tie.
     """
-    ours, theirs = np.asarray(ours, dtype=float), np.asarray(theirs, dtype=float)
+    a, b = np.asarray(ours, dtype=float), np.asarray(theirs, dtype=float)
     return (
-        int(np.count_nonzero(ours * (1 + TIE) < theirs)),
-        int(np.count_nonzero(theirs * (1 + TIE) < ours)),
+        int(np.count_nonzero(a * (1 + TIE) < b)),
+        int(np.count_nonzero(b * (1 + TIE) < a)),
     )

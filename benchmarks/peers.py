@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from importlib.util import find_spec
+from typing import Any
 
 import cv2
 import numpy as np
@@ -73,6 +74,15 @@ def _cv2(X: Floats, flag: int, s: Settings) -> Floats | None:
         return None
     F, _ = _engine.Robust(flag, s.threshold, s.confidence, s.max_iters).plain(*_split(X))
     return usable(F)
+
+
+def _cv2_method(flag: int) -> Estimator:
+    def estimate(pair: Pair, s: Settings) -> Floats | None:
+        # PROSAC's callers hand the best match first; all others get the shuffled rows.
+        X = _in_score_order(pair)[0] if flag == cv2.USAC_PROSAC else pair.X
+        return _cv2(X, flag, s)
+
+    return estimate
 
 
 def _cv2_prosac_magsac(X: Floats, s: Settings) -> Floats | None:
@@ -147,13 +157,14 @@ def _gms(pair: Pair, X: Floats) -> NDArray[np.bool_]:
     # cv2 writes outside its grid for points outside the image.
     sizes = (pair.size1, pair.size2)
     inside = [np.clip(p, 0, np.array(size) - 1.0) for p, size in zip(_split(X), sizes, strict=True)]
-    keypoints = [cv2.KeyPoint.convert(p.astype(np.float32)) for p in inside]
+    # cv2's stubs know neither of these calls.
+    convert: Any = cv2.KeyPoint.convert
+    match_gms: Any = cv2.xfeatures2d.matchGMS
+    keypoints = [convert(p.astype(np.float32)) for p in inside]
     matches = [cv2.DMatch(i, i, 0.0) for i in range(len(X))]
     kept = np.zeros(len(X), dtype=bool)
     try:
-        found = cv2.xfeatures2d.matchGMS(
-            *sizes, *keypoints, matches, withRotation=True, withScale=True
-        )
+        found = match_gms(*sizes, *keypoints, matches, withRotation=True, withScale=True)
     except cv2.error:
         return kept
     kept[[match.queryIdx for match in found]] = True
@@ -182,7 +193,6 @@ def _filtered(
 
 def _ours(flag: int, with_scores: bool, density: str = "contrast") -> Estimator:
     def estimate(pair: Pair, s: Settings) -> Floats | None:
-        # PROSAC's callers hand the best match first; all others get the shuffled rows.
         X, scores = _in_score_order(pair) if flag == cv2.USAC_PROSAC else (pair.X, pair.scores)
         return estimate_fundamental(
             X[:, :2],
@@ -216,15 +226,7 @@ def _all_methods() -> list[Method]:
     for name in CV2_METHODS:
         flag = getattr(cv2, name)
         prosac = flag == cv2.USAC_PROSAC
-        methods.append(
-            Method(
-                f"cv2:{name}",
-                lambda pair, s, flag=flag, prosac=prosac: _cv2(
-                    _in_score_order(pair)[0] if prosac else pair.X, flag, s
-                ),
-                uses_scores=prosac,
-            )
-        )
+        methods.append(Method(f"cv2:{name}", _cv2_method(flag), uses_scores=prosac))
     magsac = cv2.USAC_MAGSAC
     methods += [
         Method(

@@ -1,0 +1,176 @@
+"""``python -m benchmarks real | synthetic | stages``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+from tqdm import tqdm
+
+from benchmarks import report
+from benchmarks.data import Pair, load_pairs
+from benchmarks.peers import METHODS, Method, Settings, choose
+from benchmarks.run import Record, measure, one_thread, warm_up
+from benchmarks.scenes import KINDS, make_scene, scenes
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; 2 for arguments that make no sense."""
+    args = _parser().parse_args(argv)
+    try:
+        return int(args.run(args))
+    except ValueError as error:
+        print(f"benchmarks: {error}", file=sys.stderr)
+        return 2
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks",
+        description="Estimators of the fundamental matrix side by side.",
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    shared = argparse.ArgumentParser(add_help=False)
+    shared.add_argument(
+        "--methods",
+        nargs="+",
+        default=["*"],
+        metavar="NAME",
+        help=f"names or shell patterns; default all. Known: {', '.join(METHODS)}",
+    )
+    shared.add_argument("--threshold", nargs="+", type=float, default=[1.0], metavar="PX")
+    shared.add_argument("--confidence", type=float, default=0.999)
+    shared.add_argument("--max-iters", type=int, default=5000)
+    shared.add_argument("--seed", type=int, default=0, help="of the shuffle and of the methods")
+    shared.add_argument(
+        "--time-repeats", type=int, default=1, metavar="N", help="call N times, the fastest counts"
+    )
+    shared.add_argument("--json", metavar="FILE", help="write every record and the summaries")
+    shared.add_argument("--plots", metavar="DIR", help="draw error cumulatives and time")
+
+    real = commands.add_parser("real", parents=[shared], help="real pairs with ground truth")
+    real.add_argument("--data", required=True, metavar="DIR", help="folder of .npz files")
+    real.add_argument(
+        "--cut",
+        nargs="+",
+        default=["all"],
+        type=_cut,
+        metavar="RATIO",
+        help="keep SIFT ratios below this; 'all' keeps everything (default)",
+    )
+    real.add_argument("--sets", nargs="+", metavar="SET", help="only these sets")
+    real.set_defaults(run=_real)
+
+    synthetic = commands.add_parser("synthetic", parents=[shared], help="scenes with a known F")
+    synthetic.add_argument("--scenes", nargs="+", choices=KINDS, default=list(KINDS))
+    synthetic.add_argument("--n", nargs="+", type=int, metavar="N", help="numbers of matches")
+    synthetic.add_argument("--inlier-ratio", nargs="+", type=float, metavar="SHARE")
+    synthetic.add_argument("--noise", nargs="+", type=float, metavar="PX")
+    synthetic.add_argument(
+        "--repeats", type=int, default=10, metavar="N", help="scenes per cell (default 10)"
+    )
+    synthetic.set_defaults(run=_synthetic)
+
+    stages = commands.add_parser("stages", help="time of each stage of ours")
+    stages.add_argument("--n", nargs="+", type=int, default=[500, 2000, 8000], metavar="N")
+    stages.add_argument("--inlier-ratio", type=float, default=0.3, metavar="SHARE")
+    stages.add_argument("--method", default="usac_accurate")
+    stages.add_argument("--repeats", type=int, default=10, metavar="N")
+    stages.set_defaults(run=_stages)
+    return parser
+
+
+def _cut(text: str) -> float | str:
+    return text if text == "all" else float(text)
+
+
+def _real(args: argparse.Namespace) -> int:
+    sections = {
+        "all matches" if cut == "all" else f"SIFT ratio < {cut:g}": load_pairs(
+            args.data, cut, args.seed, args.sets
+        )
+        for cut in args.cut
+    }
+    return _compare(args, sections)
+
+
+def _synthetic(args: argparse.Namespace) -> int:
+    sections: dict[str, list[Pair]] = defaultdict(list)
+    for kind, pair in scenes(
+        args.scenes,
+        args.repeats,
+        args.seed,
+        numbers=args.n,
+        ratios=args.inlier_ratio,
+        noises=args.noise,
+    ):
+        sections[kind].append(pair)
+    return _compare(args, sections)
+
+
+def _compare(args: argparse.Namespace, sections: dict[str, list[Pair]]) -> int:
+    methods, skipped = choose(args.methods)
+    if skipped:
+        print(f"not installed, left out: {', '.join(skipped)}", file=sys.stderr)
+    records = _run(args, sections, methods)
+    print(report.markdown(records, skipped))
+    if args.json:
+        settings = {k: v for k, v in vars(args).items() if k not in ("run", "json", "plots")}
+        report.write_json(args.json, records, settings)
+    if args.plots:
+        for path in report.write_plots(args.plots, records):
+            print(path, file=sys.stderr)
+    return 0
+
+
+def _run(
+    args: argparse.Namespace, sections: dict[str, list[Pair]], methods: Sequence[Method]
+) -> list[Record]:
+    n = sum(map(len, sections.values())) * len(args.threshold)
+    records = []
+    with tqdm(total=n, unit="pair") as progress:
+        for threshold in args.threshold:
+            settings = Settings(threshold, args.confidence, args.max_iters, args.seed)
+            warm_up(methods, settings)
+            with one_thread():
+                for section, pairs in sections.items():
+                    progress.set_description(f"{section}, {threshold:g} px")
+                    for pair in pairs:
+                        records += measure(section, pair, methods, settings, args.time_repeats)
+                        progress.update()
+    return records
+
+
+def _stages(args: argparse.Namespace) -> int:
+    """Print the median time of each stage, ms."""
+    from cv_densityf._estimate import estimate_fundamental
+
+    print(f"| stage, ms | {' | '.join(f'N = {n}' for n in args.n)} |")
+    print(f"| --- |{' --: |' * len(args.n)}")
+    times: dict[str, dict[int, list[float]]] = defaultdict(lambda: defaultdict(list))
+    draws: dict[int, list[float]] = defaultdict(list)
+    with one_thread():
+        for n in args.n:
+            for seed in range(args.repeats):
+                X = make_scene("clusters", n, args.inlier_ratio, 0.5, seed).X
+                # Twice, the second counts: the first touches cold memory.
+                for _ in range(2):
+                    estimate = estimate_fundamental(X[:, :2], X[:, 2:], method=args.method)
+                draws[n].append(estimate.n_draws)
+                for stage, ms in estimate.timings.items():
+                    times[stage][n].append(ms)
+    for stage, by_n in times.items():
+        print(f"| {stage} | {' | '.join(_median(by_n[n], '.2f') for n in args.n)} |")
+    print(f"| draws | {' | '.join(_median(draws[n], '.0f') for n in args.n)} |")
+    return 0
+
+
+def _median(values: Sequence[float], form: str) -> str:
+    return format(float(np.median(values)), form) if values else ""
+
+
+if __name__ == "__main__":
+    sys.exit(main())
