@@ -186,8 +186,8 @@ def plot_matches(
     mask = None if mask is None else _mask(mask, len(X), "mask")[finite]
     X, kept = X[finite], kept[finite]
     ax = _axes(ax, (16, 6))
-    shift1, shift2, _ = _show(ax, image1, image2, X)
-    shown1, shown2 = X[:, :2] + shift1, X[:, 2:] + shift2
+    place1, place2 = _show(ax, image1, image2, X)
+    shown1, shown2 = place1(X[:, :2]), place2(X[:, 2:])
 
     from matplotlib.collections import LineCollection
 
@@ -266,18 +266,17 @@ def plot_epipolar_lines(
     finite = _finite(X)
     mask = finite if mask is None else _mask(mask, len(X), "mask")
     ax = _axes(ax, (16, 6))
-    shift1, shift2, extents = _show(ax, image1, image2, X[finite])
+    places = _show(ax, image1, image2, X[finite])
     for number, row in enumerate(_far_apart(X, np.flatnonzero(mask & finite), n_lines)):
         color = _OKABE_ITO[number % len(_OKABE_ITO)]
         point1, point2 = X[row, :2], X[row, 2:]
         lines = (F.T @ [*point2, 1], F @ [*point1, 1])
-        sides = zip((point1, point2), lines, (shift1, shift2), extents, strict=True)
-        for point, line, shift, extent in sides:
-            ends = _clipped(line, extent)
+        for point, line, place in zip((point1, point2), lines, places, strict=True):
+            ends = _clipped(line, place.extent)
             if ends is not None:
-                ax.plot(*(ends + shift).T, color="black", lw=3.2, alpha=0.6, zorder=3)
-                ax.plot(*(ends + shift).T, color=color, lw=1.8, zorder=4)
-            x, y = point + shift
+                ax.plot(*place(ends).T, color="black", lw=3.2, alpha=0.6, zorder=3)
+                ax.plot(*place(ends).T, color=color, lw=1.8, zorder=4)
+            x, y = place(point)
             ax.plot(x, y, "o", ms=7, color=color, mec="black", mew=1, zorder=5)
             ax.annotate(
                 str(number + 1), (x, y), (6, 6), textcoords="offset points", fontsize=11,
@@ -417,22 +416,33 @@ def _classes(
             yield style, rows
 
 
+@dataclass(frozen=True)
+class _Place:
+    """Where an image is shown in the axes.
+
+    ``extent`` is ((left, top), (right, bottom)) in pixels of the image itself.
+    """
+
+    extent: NDArray[np.float64]
+    scale: float
+    shift: NDArray[np.float64]
+
+    def __call__(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Move points in pixels of the image to the axes."""
+        return points * self.scale + self.shift
+
+
 def _show(
     ax: Axes, image1: NDArray[Any] | None, image2: NDArray[Any] | None, X: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[NDArray[np.float64], ...]]:
-    """Show the images side by side; the shift of each one's points, and their extents.
-
-    An extent is ((left, top), (right, bottom)) in pixels of the image itself.
-    """
-    extents = tuple(
-        _extent(image, points) for image, points in ((image1, X[:, :2]), (image2, X[:, 2:]))
-    )
-    (low1, high1), (low2, _) = extents
-    gap = _GAP * (high1[0] - low1[0])
-    shift1 = -low1
-    shift2 = np.array([high1[0] - low1[0] + gap, 0]) - low2
-    for image, extent, shift in zip((image1, image2), extents, (shift1, shift2), strict=True):
-        (left, top), (right, bottom) = extent + shift
+) -> tuple[_Place, _Place]:
+    """Show the images side by side, equally high."""
+    extent1, extent2 = _extent(image1, X[:, :2]), _extent(image2, X[:, 2:])
+    width, height = extent1[1] - extent1[0]
+    scale = height / (extent2[1, 1] - extent2[0, 1])
+    shift2 = np.array([(1 + _GAP) * width, 0]) - scale * extent2[0]
+    places = _Place(extent1, 1.0, -extent1[0]), _Place(extent2, scale, shift2)
+    for image, place in zip((image1, image2), places, strict=True):
+        (left, top), (right, bottom) = place(place.extent)
         if image is not None:
             # Only the light greys: lines and points stay visible on them.
             ax.imshow(
@@ -441,11 +451,9 @@ def _show(
             )  # fmt: skip
         frame = np.array([[left, right, right, left, left], [top, top, bottom, bottom, top]])
         ax.plot(*frame, color="0.4", lw=1, zorder=1, clip_on=False)
-    corners = np.vstack([extents[0] + shift1, extents[1] + shift2])
-    (left, top), (right, bottom) = corners.min(axis=0), corners.max(axis=0)
-    ax.set(xlim=(left, right), ylim=(bottom, top), aspect="equal")
+    ax.set(xlim=(0, right), ylim=(height, 0), aspect="equal")
     ax.axis("off")
-    return shift1, shift2, extents
+    return places
 
 
 def _extent(image: NDArray[Any] | None, points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -455,8 +463,10 @@ def _extent(image: NDArray[Any] | None, points: NDArray[np.float64]) -> NDArray[
     if len(points) == 0:
         return np.array([[0.0, 0.0], [1.0, 1.0]])
     low, high = points.min(axis=0), points.max(axis=0)
-    margin = 0.03 * max(float((high - low).max()), 1e-9)
-    return np.array([low - margin, high + margin])
+    center, half = (low + high) / 2, (high - low) / 2
+    # A margin, and no sliver where all points lie in a row.
+    half = np.maximum(1.06 * half, half.max() / 3 if half.max() > 0 else 1.0)
+    return np.array([center - half, center + half])
 
 
 def _legend_above(ax: Axes, handles: list[Any]) -> None:

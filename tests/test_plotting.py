@@ -114,15 +114,17 @@ class TestMatches:
         assert set(legend(ax)) == set(sets)
 
     def test_points_lie_on_their_images(self, ax):
-        plot_matches(IMAGE, IMAGE[:500, :700], SCENE.X, ax=ax)
+        # The second image is shown as high as the first, twice its size.
+        plot_matches(IMAGE, IMAGE[:480, :700], SCENE.X, ax=ax)
         shown = np.vstack([line.get_xydata() for line in ax.lines if "kept" in line.get_label()])
-        first, second = ax.images
-        (left, right, bottom, top) = second.get_extent()
-        # The first image keeps its pixel coordinates up to half a pixel, the second is moved.
+        first, second = (image.get_extent() for image in ax.images)
+        for (left, right, bottom, top), size in ((first, (1280, 960)), (second, (1400, 960))):
+            assert (right - left, bottom - top) == size
+        assert first[1] < second[0]
+        # An image begins half a pixel before the middle of its first pixel.
         np.testing.assert_allclose(shown[:60], SCENE.points1 + 0.5)
-        np.testing.assert_allclose(shown[60:], SCENE.points2 + np.array([left, top]) + 0.5)
-        assert first.get_extent()[1] < left
-        assert (right - left, bottom - top) == (700, 500)
+        expected = (SCENE.points2 + 0.5) * 2 + [second[0], 0]
+        np.testing.assert_allclose(shown[60:], expected)
 
     def test_lines_join_the_points(self, ax):
         plot_matches(IMAGE, IMAGE, SCENE.X, max_lines=20, ax=ax)
@@ -153,6 +155,12 @@ class TestMatches:
     def test_kinds_of_images(self, ax, image):
         plot_matches(image, IMAGE, SCENE.X, ax=ax)
         assert len(ax.images) == 2
+
+    @pytest.mark.parametrize("X", [np.full((9, 4), 7.0), np.outer(np.arange(9), [1, 0, 0, 5])])
+    def test_no_spread(self, ax, X):
+        plot_matches(None, None, X, ax=ax)
+        (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+        assert 0.1 < (right - left) / (bottom - top) < 10
 
     @pytest.mark.parametrize("n", [0, 1])
     def test_few(self, ax, n):
