@@ -24,7 +24,14 @@ from cv_densityf._engine import METHODS, Robust, method_flag
 from cv_densityf._epipolar import Floats, residuals
 from cv_densityf._estimate import Estimate, estimate_fundamental
 from cv_densityf._files import InputError, read_matches, replacing
-from cv_densityf.matching import detect, match_features, match_images, read_image
+from cv_densityf.matching import (
+    MAX_FEATURES,
+    MAX_SIZE,
+    detect,
+    match_features,
+    match_images,
+    read_image,
+)
 
 FOUND, NOT_FOUND, WRONG_USE = 0, 1, 2
 _MIN_MATCHES = 8
@@ -182,13 +189,13 @@ def _add_match(commands: argparse._SubParsersAction[Any]) -> None:
         help="Lowe's ratio test, such as 0.8 (keep all matches)",
     )
     matching.add_argument(
-        "--max-features", metavar="N", type=_POSITIVE_INT, help="per image (8000)"
+        "--max-features", metavar="N", type=_POSITIVE_INT, help=f"per image ({MAX_FEATURES})"
     )
     matching.add_argument(
         "--max-size",
         metavar="PX",
         type=_POSITIVE_INT,
-        help="shrink images to this longer side, pixels (1600)",
+        help=f"shrink images to this longer side, pixels ({MAX_SIZE})",
     )
     output = match.add_argument_group("output")
     output.add_argument("--json", action="store_true", help="print JSON, and nothing else")
@@ -257,8 +264,8 @@ def _run_match(options: argparse.Namespace) -> int:
         with _stage("reading", timings):
             images = (read_image(options.images[0]), read_image(options.images[1]))
         limits = {
-            "max_size": options.max_size or 1600,
-            "max_features": options.max_features or 8000,
+            "max_size": options.max_size or MAX_SIZE,
+            "max_features": options.max_features or MAX_FEATURES,
         }
         with _stage("features", timings):
             features = [detect(image, **limits) for image in images if image is not None]
@@ -297,8 +304,9 @@ def _run_match(options: argparse.Namespace) -> int:
         **_report(X, robust, estimate, plain, timings),
     }
     print(json.dumps(report, allow_nan=False) if options.json else _for_people(report))
-    if not estimate:
-        return _complain(f"no fundamental matrix found: {estimate.reason}", NOT_FOUND)
+    if report["F"] is None:
+        reason = "cv2's numbers are not finite" if estimate else estimate.reason
+        return _complain(f"no fundamental matrix found: {reason}", NOT_FOUND)
     if options.output is not None:
         _write(options.output, X, scores, estimate, report)
     if options.plot is not None:
@@ -316,7 +324,7 @@ def _report(
 ) -> dict[str, Any]:
     """Everything `match` says, as JSON can hold it."""
     return {
-        "F": None if estimate.F is None else estimate.F.tolist(),
+        "F": _usable(estimate.F),
         "reason": estimate.reason,
         "n_matches": len(X),
         "n_kept": int(estimate.kept.sum()),
@@ -338,10 +346,15 @@ def _report(
 def _plain_report(X: Floats, robust: Robust, F: Floats | None, mask: Any) -> dict[str, Any]:
     inliers = np.zeros(len(X), dtype=bool) if F is None else mask.ravel() > 0
     return {
-        "F": None if F is None else F.tolist(),
+        "F": _usable(F),
         "n_inliers": int(inliers.sum()),
         "median_residual": _median_residual(F, X[inliers], robust),
     }
+
+
+def _usable(F: Floats | None) -> list[list[float]] | None:
+    """Rows of ``F``; None as well where cv2 answers with a matrix of NaN."""
+    return None if F is None or not np.isfinite(F).all() else F.tolist()
 
 
 def _median_residual(F: Floats | None, X: Floats, robust: Robust) -> float | None:

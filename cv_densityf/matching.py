@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 
 from cv_densityf._files import InputError
 
+#: Longer side, pixels, and number of features: enough for a precise F within about a second.
+MAX_SIZE = 1600
+MAX_FEATURES = 8000
+
 #: Rows of the similarity matrix held in memory at a time.
 _CHUNK = 1024
 
@@ -98,7 +102,7 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[Any]:
 
 
 def detect(
-    image: NDArray[Any], *, max_size: int | None = 1600, max_features: int | None = 8000
+    image: NDArray[Any], *, max_size: int | None = MAX_SIZE, max_features: int | None = MAX_FEATURES
 ) -> Features:
     """Find SIFT features and describe them with RootSIFT.
 
@@ -204,8 +208,8 @@ def match_images(
     image1: NDArray[Any],
     image2: NDArray[Any],
     *,
-    max_size: int | None = 1600,
-    max_features: int | None = 8000,
+    max_size: int | None = MAX_SIZE,
+    max_features: int | None = MAX_FEATURES,
     ratio: float | None = None,
     mutual: bool = True,
 ) -> Matches:

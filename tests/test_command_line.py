@@ -223,6 +223,18 @@ class TestNoF:
         assert json.loads(out)["F"] is None
         assert json.loads(out)["reason"]
 
+    def test_a_matrix_of_nan_is_none(self, run, tmp_path):
+        # cv2's 8-point method answers NaN where a single point is not finite.
+        X = np.vstack([SCENE.X[SCENE.inliers][:20], [[np.nan, 1, 2, 3]]])
+        np.savez(tmp_path / "nan.npz", points1=X[:, :2], points2=X[:, 2:])
+        arguments = ("match", "--points", tmp_path / "nan.npz", "--method", "8point", "--json")
+        code, out, err = run(*arguments, "-o", tmp_path / "out.npz")
+        report = json.loads(out, parse_constant=pytest.fail)
+        assert report["cv2"]["F"] is None
+        assert code == (0 if report["F"] else 1)
+        assert (tmp_path / "out.npz").exists() == (code == 0)
+        assert err.count("\n") == code
+
     def test_nothing_is_written(self, run, constant, tmp_path):
         run("match", "--points", constant, "-o", tmp_path / "o.npz", "--plot", tmp_path / "p.png")
         assert [path.name for path in tmp_path.iterdir()] == ["same.npz"]

@@ -75,11 +75,12 @@ class TestTwoViewScene:
             two_view_scene(**{"n": 10, name: value})
 
 
-class TestMotorcycle:
-    @pytest.fixture(scope="class")
-    def pair(self):
-        return motorcycle()
+@pytest.fixture(scope="module")
+def pair():
+    return motorcycle()
 
+
+class TestMotorcycle:
     def test_correspondences_fit_F(self, pair):
         X = np.hstack([pair.points1, pair.points2])
         assert len(X) > 10_000
@@ -113,8 +114,8 @@ class TestMotorcycle:
         points = np.random.default_rng(0).uniform(0, 100, (20, 2))
         image = np.zeros((1, 1, 3), np.uint8)
         moved = points + np.array([7, 3])
-        pair = ImagePair(image, image, F, points, moved)
-        assert pair.error(5 * F) == pytest.approx(3)
+        rectified = ImagePair(image, image, F, points, moved)
+        assert rectified.error(5 * F) == pytest.approx(3)
 
     def test_without_scikit_image(self, monkeypatch):
         monkeypatch.setattr(datasets, "find_spec", lambda name: None)
