@@ -50,6 +50,19 @@ def run(capfd):
     return run
 
 
+@pytest.fixture
+def asked(monkeypatch):
+    """Options of each call of the estimator."""
+    calls = []
+
+    def spy(*arguments, **options):
+        calls.append(options)
+        return estimate_fundamental(*arguments, **options)
+
+    monkeypatch.setattr("cv_densityf.__main__.estimate_fundamental", spy)
+    return calls
+
+
 def test_points_to_json(run, npz):
     code, out, err = run("match", "--points", npz, "--json")
     report = json.loads(out)
@@ -84,32 +97,26 @@ def test_plain_cv2_stands_beside_it(run, npz):
         {"random_state": 7},
     ],
 )
-def test_options_reach_the_estimate(run, npz, options):
+def test_options_reach_the_estimate(run, npz, asked, options):
     flags = []
     for name, value in options.items():
         flags += [f"--{name.replace('_', '-').replace('random-state', 'seed')}", value]
     code, out, _ = run("match", "--points", npz, "--json", *flags)
+    assert code == 0
+    assert options.items() <= asked[0].items()
     expected = estimate_fundamental(SCENE.points1, SCENE.points2, **options)
     report = json.loads(out)
-    assert code == 0
     np.testing.assert_array_equal(report["F"], expected.F)
     assert report["n_kept"] == expected.kept.sum()
     assert report["n_draws"] == expected.n_draws
 
 
-def test_scores_reach_the_estimate(run, tmp_path, monkeypatch):
+def test_scores_reach_the_estimate(run, tmp_path, asked):
     scores = np.random.default_rng(0).uniform(size=400)
     path = tmp_path / "matches.npz"
     np.savez(path, points1=SCENE.points1, points2=SCENE.points2, scores=scores)
-    seen = []
-
-    def spy(*arguments, **options):
-        seen.append(options["scores"])
-        return estimate_fundamental(*arguments, **options)
-
-    monkeypatch.setattr("cv_densityf.__main__.estimate_fundamental", spy)
     assert run("match", "--points", path)[0] == 0
-    np.testing.assert_array_equal(seen[0], scores)
+    np.testing.assert_array_equal(asked[0]["scores"], scores)
 
 
 def test_csv_and_npz_say_the_same(run, npz, tmp_path):

@@ -77,6 +77,17 @@ class TestOnRealImages:
         assert matches.size2 == (741, 300)
 
 
+def test_descriptors_are_rootsift(grey):
+    # The Hellinger kernel of SIFT histograms is the inner product of RootSIFT's descriptors.
+    sift = cv2.SIFT.create(enable_precise_upscale=True)
+    _, histograms = sift.detectAndCompute(grey, None)
+    histograms = histograms[:50].astype(float)
+    histograms /= histograms.sum(axis=1, keepdims=True)
+    hellinger = np.sqrt(histograms[:, None] * histograms).sum(axis=2)
+    found = detect(grey, max_features=None).descriptors[:50].astype(float)
+    np.testing.assert_allclose(found @ found.T, hellinger, atol=1e-5)
+
+
 class TestLimits:
     def test_max_size_gives_points_in_pixels_of_the_image(self, grey):
         image = grey[:400, :600]
