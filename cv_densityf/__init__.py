@@ -2,4 +2,56 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from cv_densityf._density import DensityPeaksResult, density_peaks
+from cv_densityf._estimate import Estimate, estimate_fundamental
+from cv_densityf.cv2_api import findFundamentalMat
+
+if TYPE_CHECKING:
+    from cv_densityf.estimators import (
+        DecisionGraphDisplay,
+        DensityPeaks,
+        DensityPeaksFilter,
+        FundamentalMatrixEstimator,
+    )
+    from cv_densityf.matching import Matches, match_images, read_image
+
 __version__ = "0.1.0"
+
+#: Public names whose modules import more than cv2 and scipy: loaded when first asked for.
+_LAZY = {
+    "DecisionGraphDisplay": "estimators",
+    "DensityPeaks": "estimators",
+    "DensityPeaksFilter": "estimators",
+    "FundamentalMatrixEstimator": "estimators",
+    "Matches": "matching",
+    "match_images": "matching",
+    "read_image": "matching",
+}
+
+__all__ = [
+    "DecisionGraphDisplay",
+    "DensityPeaks",
+    "DensityPeaksFilter",
+    "DensityPeaksResult",
+    "Estimate",
+    "FundamentalMatrixEstimator",
+    "Matches",
+    "density_peaks",
+    "estimate_fundamental",
+    "findFundamentalMat",
+    "match_images",
+    "read_image",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return getattr(import_module(f"cv_densityf.{_LAZY[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -54,6 +54,14 @@ def method_flag(method: str | int) -> int:
     raise ValueError(f"unknown method {method!r}; choose one of {', '.join(METHODS)}")
 
 
+def method_name(robust: Robust) -> str:
+    """Name of the method that cv2 will run."""
+    if robust.params is not None:
+        return "usac"
+    names = {flag: name for name, flag in METHODS.items()}
+    return names.get(robust.flag, "lmeds")
+
+
 def is_usac(flag: int) -> bool:
     """Whether cv2 sends this method to its USAC framework."""
     return flag in _USAC_FLAGS
@@ -90,3 +98,30 @@ class Robust:
         except cv2.error:
             return None, None
         return (F, mask) if F is not None else (None, None)
+
+
+def draw(
+    points: NDArray[np.float32], threshold: float, confidence: float, max_iters: int, seed: int
+) -> NDArray[np.float64] | None:
+    """Make one quick, seeded draw with cv2's USAC: MSAC score, inner local optimisation.
+
+    Returns
+    -------
+    array, shape (3, 3), or None
+        None where cv2 raises or finds no finite matrix.
+    """
+    params = cv2.UsacParams()
+    params.threshold = threshold
+    params.confidence = confidence
+    params.maxIterations = max_iters
+    params.randomGeneratorState = seed
+    params.sampler = cv2.SAMPLING_UNIFORM
+    params.score = cv2.SCORE_METHOD_MSAC
+    params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
+    params.loIterations = 10
+    params.loSampleSize = 12
+    try:
+        F, _ = original(points[:, :2], points[:, 2:], params)
+    except cv2.error:
+        return None
+    return F if F is not None and np.isfinite(F).all() else None

@@ -6,6 +6,7 @@ matrix satisfies ``[x', y', 1] @ F @ [x, y, 1] == 0``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -31,7 +32,7 @@ def _sampson_squared(F: Floats, X: Floats) -> Floats:
     return algebraic * algebraic / (a * a + b * b + d * d + e * e)
 
 
-def _point_line_squared(F: Floats, X: Floats) -> Floats:
+def point_line_squared(F: Floats, X: Floats) -> Floats:
     """Larger of the two squared point-to-epipolar-line distances, (n,) float64."""
     x, y, u, v = X.astype(np.float32).astype(np.float64).T
     a = F[0, 0] * x + F[0, 1] * y + F[0, 2]
@@ -60,7 +61,7 @@ def residuals(F: Floats, X: Floats, rule: Rule) -> Floats:
     if rule == "usac":
         return sampson_distance(F, X)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.sqrt(_point_line_squared(F, X))
+        return np.sqrt(point_line_squared(F, X))
 
 
 def inlier_mask(F: Floats, X: Floats, rule: Rule, threshold: float) -> NDArray[np.bool_]:
@@ -75,7 +76,7 @@ def inlier_mask(F: Floats, X: Floats, rule: Rule, threshold: float) -> NDArray[n
         if rule == "usac":
             error = _sampson_squared(F.astype(np.float32), X.astype(np.float32))
             return np.asarray(error.astype(np.float64) < threshold * threshold)
-        error = _point_line_squared(F, X).astype(np.float32)
+        error = point_line_squared(F, X).astype(np.float32)
         if rule == "lmeds":
             threshold = _lmeds_threshold(error[np.isfinite(error)])
         return np.asarray(error <= np.float32(threshold * threshold))
@@ -87,3 +88,169 @@ def _lmeds_threshold(error: Floats) -> float:
         return _LMEDS_MIN_SIGMA
     median = float(np.partition(error, n // 2)[n // 2])
     return max(_LMEDS_SCALE * (1 + 5.0 / (n - 7)) * float(np.sqrt(median)), _LMEDS_MIN_SIGMA)
+
+
+#: A symmetric 9 x 9 matrix from its upper triangle, which is summed once per match.
+_ROWS, _COLUMNS = np.triu_indices(9)
+_SQUARE = np.empty((9, 9), dtype=np.intp)
+_SQUARE[_ROWS, _COLUMNS] = _SQUARE[_COLUMNS, _ROWS] = np.arange(45)
+
+
+class Frame:
+    """Matches in coordinates that keep least squares well conditioned.
+
+    Both images are centred and divided by the *same* scale (the root mean square distance from the
+    centroids), so that a residual in this frame is a residual in pixels times ``scale``. Hartley,
+    "In defense of the eight-point algorithm" (1997).
+    """
+
+    __slots__ = ("_first", "_second", "homogeneous1", "homogeneous2", "outer", "products", "scale")
+
+    def __init__(self, X: Floats) -> None:
+        centre = X.mean(axis=0)
+        spread = np.sqrt(((X - centre) ** 2).mean())
+        self.scale = 1.0 / spread if spread > 0 else 1.0
+        Z = (X - centre).T * self.scale
+        ones = np.ones((1, len(X)))
+        self.homogeneous1 = np.concatenate([Z[:2], ones])
+        self.homogeneous2 = np.concatenate([Z[2:], ones])
+        self.products = (self.homogeneous2[:, None] * self.homogeneous1[None]).reshape(9, -1)
+        self.outer = self.products[_ROWS] * self.products[_COLUMNS]
+        self._first = _centring(centre[:2], self.scale)
+        self._second = _centring(centre[2:], self.scale)
+
+    def enter(self, F: Floats) -> Floats:
+        """Fundamental matrices (m, 3, 3) in pixels, in this frame and of unit norm."""
+        G = np.linalg.inv(self._second).T @ F @ np.linalg.inv(self._first)
+        return np.asarray(G / np.linalg.norm(G, axis=(1, 2), keepdims=True))
+
+    def leave(self, G: Floats) -> Floats:
+        """Fundamental matrices (m, 3, 3) of this frame, in pixels."""
+        return np.asarray(self._second.T @ G @ self._first)
+
+    def errors(self, G: Floats) -> tuple[Floats, Floats]:
+        """Algebraic error and squared gradient norm of each match under each matrix, (m, n)."""
+        lines2 = G[:, :2] @ self.homogeneous1
+        lines1 = G.transpose(0, 2, 1)[:, :2] @ self.homogeneous2
+        norm = np.einsum("mkn,mkn->mn", lines2, lines2)
+        norm += np.einsum("mkn,mkn->mn", lines1, lines1)
+        return G.reshape(-1, 9) @ self.products, norm
+
+    def sampson(self, G: Floats) -> Floats:
+        """Squared Sampson distances in squared pixels, (m, n)."""
+        algebraic, norm = self.errors(G)
+        return algebraic * algebraic / (norm * self.scale**2 + _TINY)
+
+
+def _centring(centre: Floats, scale: float) -> Floats:
+    return np.array(
+        [[scale, 0.0, -scale * centre[0]], [0.0, scale, -scale * centre[1]], [0.0, 0.0, 1.0]]
+    )
+
+
+_TINY = 1e-300
+#: Generators of the rotations about the three axes.
+_SKEW = np.zeros((3, 3, 3))
+_SKEW[0, 2, 1] = _SKEW[1, 0, 2] = _SKEW[2, 1, 0] = 1.0
+_SKEW[0, 1, 2] = _SKEW[1, 2, 0] = _SKEW[2, 0, 1] = -1.0
+
+
+def eight_point(samples: Floats) -> NDArray[np.float64]:
+    """Fundamental matrices of sets of eight or more matches each.
+
+    Hartley's normalised eight-point algorithm: least squares for F in normalised coordinates,
+    then the nearest matrix of rank 2; equations (3) to (8) of Wu and Wan.
+
+    Parameters
+    ----------
+    samples : array, shape (m, k, 4)
+        m sets of k >= 8 matches.
+
+    Returns
+    -------
+    array, shape (m, 3, 3)
+        Matrices of rank 2 and unit norm, in pixels.
+    """
+    m, k, _ = samples.shape
+    transforms, points = [], []
+    for Y in (samples[..., :2], samples[..., 2:]):
+        centre = Y.mean(axis=1, keepdims=True)
+        scale = np.sqrt(2.0) / (np.linalg.norm(Y - centre, axis=2).mean(axis=1) + _TINY)
+        T = np.zeros((m, 3, 3))
+        T[:, 0, 0] = T[:, 1, 1] = scale
+        T[:, :2, 2] = -scale[:, None] * centre[:, 0]
+        T[:, 2, 2] = 1.0
+        transforms.append(T)
+        Z = np.ones((m, k, 3))
+        Z[..., :2] = (Y - centre) * scale[:, None, None]
+        points.append(Z)
+    A = (points[1][..., :, None] * points[0][..., None, :]).reshape(m, k, 9)
+    G = np.linalg.svd(A, full_matrices=True)[2][:, 8].reshape(m, 3, 3)
+    U, S, Vt = np.linalg.svd(G)
+    S[:, 2] = 0.0
+    F = transforms[1].transpose(0, 2, 1) @ ((U * S[:, None]) @ Vt) @ transforms[0]
+    return np.asarray(F / np.linalg.norm(F, axis=(1, 2), keepdims=True))
+
+
+def polish(frame: Frame, G: Floats, scales: Sequence[float | Floats]) -> Floats:
+    """Refine fundamental matrices on all matches, one weighted Gauss-Newton step per scale.
+
+    Minimises the Sampson distances under Geman-McClure weights ``1 / (1 + (r / scale)^2)^2`` over
+    the seven degrees of freedom of a rank-2 matrix ``U diag(cos a, sin a, 0) V^T`` (Bartoli and
+    Sturm, "Nonlinear estimation of the fundamental matrix with minimal parameters", 2004). The
+    gradient norm in the Sampson distance is held fixed within a step, as in iteratively reweighted
+    least squares.
+
+    Parameters
+    ----------
+    frame : Frame
+        The matches.
+    G : array, shape (m, 3, 3)
+        Starting matrices in the frame.
+    scales : sequence of float or of arrays of shape (m,)
+        Width of the weights in pixels, step by step.
+
+    Returns
+    -------
+    array, shape (m, 3, 3)
+        Refined matrices of rank 2 and unit norm, in the frame.
+    """
+    U, S, Vt = np.linalg.svd(G)
+    angle = np.arctan2(S[:, 1], S[:, 0])
+    m = len(G)
+    for scale in scales:
+        c, s = np.cos(angle), np.sin(angle)
+        D = np.zeros((m, 3, 3))
+        D[:, 0, 0], D[:, 1, 1] = c, s
+        G = U @ D @ Vt
+        algebraic, norm = frame.errors(G)
+        norm += _TINY
+        width = np.asarray(scale, dtype=float).reshape(-1, 1) * frame.scale
+        weight = 1.0 / (1.0 + algebraic * algebraic / (norm * width**2))
+        weight *= weight / norm
+        gram = (weight @ frame.outer.T)[:, _SQUARE]
+        W = np.empty((m, 7, 3, 3))
+        W[:, :3] = _SKEW @ D[:, None]
+        W[:, 3:6] = D[:, None] @ _SKEW
+        W[:, 6] = 0.0
+        W[:, 6, 0, 0], W[:, 6, 1, 1] = -s, c
+        tangent = (U[:, None] @ W @ Vt[:, None]).reshape(m, 7, 9)
+        half = tangent @ gram
+        hessian = half @ tangent.transpose(0, 2, 1)
+        gradient = half @ G.reshape(m, 9, 1)
+        damping = 1e-9 * np.trace(hessian, axis1=1, axis2=2) + _TINY
+        hessian += damping[:, None, None] * np.eye(7)
+        step = -np.linalg.solve(hessian, gradient)[:, :, 0]
+        step *= np.minimum(1.0, 0.5 / (np.linalg.norm(step, axis=1, keepdims=True) + _TINY))
+        U = U @ _rotation(step[:, :3])
+        Vt = _rotation(step[:, 3:6]) @ Vt
+        angle = angle + step[:, 6]
+    D[:, 0, 0], D[:, 1, 1] = np.cos(angle), np.sin(angle)
+    return U @ D @ Vt
+
+
+def _rotation(axis: Floats) -> Floats:
+    """Cayley's rotation for small axis vectors (m, 3); equal to the exponential to second order."""
+    K = 0.5 * np.tensordot(axis, _SKEW, 1)
+    square = (axis * axis).sum(axis=1)[:, None, None]
+    return np.eye(3) + (K + K @ K) * (2.0 / (1.0 + 0.25 * square))

@@ -3,21 +3,60 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from numbers import Integral
+from typing import Any, Literal
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cv_densityf._engine import Robust, method_flag
-from cv_densityf._epipolar import inlier_mask, sampson_distance
+from cv_densityf._consensus import eight_point_ransac, search
+from cv_densityf._engine import Robust, method_flag, method_name
+from cv_densityf._epipolar import inlier_mask
 from cv_densityf._prefilter import contrast_support, paper_support
+from cv_densityf._stopwatch import Stopwatch
 
+Density = Literal["contrast", "paper", "off"]
+
+#: With fewer matches cv2 turns RANSAC into LMEDS, and there is no density to speak of.
 MIN_FILTERED = 15
+#: More matches than this add nothing to F: the search runs on a seeded subset, the mask on all.
+MAX_SEARCHED = 10_000
+#: cv2's direct kernels take every match as true.
+_DIRECT = (1, 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Fundamental matrix, its inliers and how they were found."""
+    """A fundamental matrix, its inliers, and how they were found.
+
+    An estimate without a fundamental matrix is falsy.
+
+    Attributes
+    ----------
+    F : array, shape (3, 3), float64, or None
+        Fundamental matrix, ``[x', y', 1] @ F @ [x, y, 1] = 0``. cv2 may return up to three,
+        stacked, for seven matches.
+    mask : array, shape (n,), bool
+        Inliers by the method's own rule.
+    kept : array, shape (n,), bool
+        The dense part: matches the density rule holds reliable.
+    reliability : array, shape (n,), float64
+        From 0 (isolated) to 1 (densest); NaN for matches the search did not look at.
+    n_draws : int
+        Hypotheses drawn; 0 if cv2's own call answered.
+    engine : str
+        What drew: ``"density"``, or the name of cv2's method that was called instead.
+    reason : str
+        One sentence on how the result came about, or why there is none.
+    timings : dict of str to float
+        Milliseconds per stage.
+    votes : tuple of float
+        The vote for each polished hypothesis, in the order of the draws.
+
+    See Also
+    --------
+    estimate_fundamental : Makes estimates.
+    """
 
     F: NDArray[np.float64] | None
     mask: NDArray[np.bool_]
@@ -37,44 +76,105 @@ class Estimate:
         """Number of inliers."""
         return int(np.count_nonzero(self.mask))
 
+    def __repr__(self) -> str:
+        found = f"{self.n_inliers} inliers of {len(self.mask)}" if self else "no F"
+        return f"<Estimate: {found}; {self.reason}>"
+
 
 def run(
     X: NDArray[np.float64],
     robust: Robust,
     *,
-    density: str = "contrast",
+    density: Density = "contrast",
     alpha: float = 0.011,
     dc_percent: float = 2.0,
     scores: NDArray[np.float64] | None = None,
     seed: int = 0,
 ) -> Estimate:
+    """Estimate F from trusted arguments: X (n, 4) float64, whose rows may hold NaN or Inf."""
+    watch = Stopwatch()
     n = len(X)
     finite = np.isfinite(X).all(axis=1)
-    kept = finite.copy()
-    reliability = finite.astype(float)
-    if density != "off" and finite.sum() >= MIN_FILTERED:
-        r, k = (
-            contrast_support(X[finite])
-            if density == "contrast"
-            else paper_support(X[finite], alpha, dc_percent)
+    rows = np.flatnonzero(finite)
+    if density == "off" or robust.flag in _DIRECT or len(rows) < MIN_FILTERED:
+        why = "density is off" if density == "off" else f"{method_name(robust)} takes no filter"
+        if len(rows) < MIN_FILTERED:
+            why = f"fewer than {MIN_FILTERED} finite matches"
+        return _plain(X, finite, robust, watch, f"cv2's own call, since {why}")
+    if len(rows) > MAX_SEARCHED:
+        rows = np.sort(np.random.default_rng(seed).choice(rows, MAX_SEARCHED, replace=False))
+    Z = X[rows] if len(rows) < n else X
+    if density == "paper":
+        r, support = paper_support(Z, alpha, dc_percent)
+    else:
+        r, support = contrast_support(Z, None if scores is None else scores[rows])
+    reliability = np.full(n, np.nan)
+    reliability[rows] = r
+    kept = np.zeros(n, dtype=bool)
+    kept[rows] = support
+    watch.lap("density")
+    asked: dict[str, Any] = {
+        "threshold": robust.threshold,
+        "confidence": robust.confidence,
+        "max_iters": robust.max_iters,
+        "seed": seed,
+    }
+    with np.errstate(all="ignore"):
+        try:
+            if density == "paper":
+                found = eight_point_ransac(Z[support], **asked)
+                watch.lap("draws")
+            else:
+                found = search(Z, r, watch=watch, **asked)
+        except np.linalg.LinAlgError:
+            found = None
+    if found is None:
+        return _plain(
+            X, finite, robust, watch, "cv2's own call, since no draw on the dense part held"
         )
-        reliability[finite], kept[finite] = r, k
-    best, votes = None, []
-    for rows in (kept, finite):
-        F, _ = Robust(cv2.USAC_MAGSAC, robust.threshold, robust.confidence, robust.max_iters).plain(
-            X[rows, :2], X[rows, 2:]
-        )
-        if F is not None:
-            d = sampson_distance(F, X[finite])
-            votes.append(float(np.maximum(0, 1 - (d / robust.threshold) ** 2).sum()))
-            if votes[-1] == max(votes):
-                best = F
-    mask = (
-        np.zeros(n, bool) if best is None else inlier_mask(best, X, robust.rule, robust.threshold)
-    )
+    mask = inlier_mask(found.F, X, robust.rule, robust.threshold)
+    watch.lap("mask")
     return Estimate(
-        F=best, mask=mask, kept=kept, reliability=reliability, n_draws=len(votes),
-        engine="usac_magsac", reason="found" if best is not None else "no F", votes=tuple(votes),
+        F=found.F,
+        mask=mask,
+        kept=kept,
+        reliability=reliability,
+        n_draws=found.n_draws,
+        engine="density",
+        reason=found.reason,
+        timings=watch.laps,
+        votes=found.votes,
+    )
+
+
+def _plain(
+    X: NDArray[np.float64],
+    finite: NDArray[np.bool_],
+    robust: Robust,
+    watch: Stopwatch,
+    reason: str,
+) -> Estimate:
+    """Answer as cv2 itself does on the finite matches."""
+    Z = X if finite.all() else X[finite]
+    F, found = robust.plain(Z[:, :2], Z[:, 2:])
+    mask = np.zeros(len(X), dtype=bool)
+    if found is not None:
+        mask[finite] = found.ravel() != 0
+    watch.lap("draws")
+    name = method_name(robust)
+    if F is None:
+        reason += (
+            f"; {name} found no F in {len(Z)} finite matches: they may be too few or degenerate"
+        )
+    return Estimate(
+        F=F,
+        mask=mask,
+        kept=finite,
+        reliability=finite.astype(np.float64),
+        n_draws=0,
+        engine=name,
+        reason=reason,
+        timings=watch.laps,
     )
 
 
@@ -86,16 +186,107 @@ def estimate_fundamental(
     threshold: float = 1.0,
     confidence: float = 0.999,
     max_iters: int = 5000,
-    density: str = "contrast",
+    density: Density = "contrast",
     alpha: float = 0.011,
     dc_percent: float = 2.0,
     scores: ArrayLike | None = None,
     random_state: int = 0,
 ) -> Estimate:
-    X = np.hstack([np.asarray(points1, float).reshape(-1, 2), np.asarray(points2, float).reshape(-1, 2)])
+    """Estimate the fundamental matrix of two images from matched points.
+
+    Hypotheses are drawn where matches are dense in (x, y, x', y'), polished on all matches and
+    picked by a vote of the reliable and well spread ones.
+
+    Parameters
+    ----------
+    points1, points2 : array-like, shape (n, 2)
+        Matched points, pixels. Rows with NaN or Inf are never inliers.
+    method : str or int
+        Name (``"ransac"``, ``"lmeds"``, ``"usac_magsac"``, ...) or cv2 constant. It decides the
+        rule of the inlier mask, and the call that answers where density cannot help.
+    threshold : float
+        Largest residual of an inlier, pixels, above 0.
+    confidence : float
+        Of each draw to have found the best model, in (0, 1).
+    max_iters : int
+        Bound on the iterations of a draw, at least 1.
+    density : {"contrast", "paper", "off"}
+        Rule for the dense part: density contrast, Wu and Wan's rho * delta, or none.
+    alpha : float
+        For ``"paper"``: matches below ``alpha * rho_max * delta_max`` are dropped; in [0, 1].
+    dc_percent : float
+        For ``"paper"``: mean share of neighbours within the cut-off distance, percent, (0, 100].
+    scores : array-like, shape (n,), optional
+        Trust in each match, higher is better (1 - SIFT ratio, a matcher's confidence). Only the
+        order counts.
+    random_state : int
+        Seed, in [0, 2^31).
+
+    Returns
+    -------
+    Estimate
+        Falsy, with a ``reason``, if no fundamental matrix was found.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ or an option is out of its range.
+
+    References
+    ----------
+    H. Wu and Y. Wan, "Fundamental matrix estimation based on clustering by density peaks".
+
+    Examples
+    --------
+    >>> from cv_densityf import estimate_fundamental
+    >>> from cv_densityf.datasets import two_view_scene
+    >>> scene = two_view_scene(500, inlier_ratio=0.4, noise=0.5, random_state=0)
+    >>> estimate = estimate_fundamental(scene.points1, scene.points2)
+    >>> bool(estimate), estimate.F.shape, estimate.mask.shape
+    (True, (3, 3), (500,))
+    """
+    first = _points(points1, "points1")
+    second = _points(points2, "points2")
+    if len(first) != len(second):
+        raise ValueError(
+            f"points1 has {len(first)} points and points2 {len(second)}; "
+            "row i of both must be one match"
+        )
+    trust = None
+    if scores is not None:
+        trust = np.asarray(scores, dtype=np.float64).ravel()
+        if len(trust) != len(first):
+            raise ValueError(f"scores has {len(trust)} entries for {len(first)} matches")
+        if np.isnan(trust).any():
+            raise ValueError("scores has NaN; give matches of unknown trust the lowest score")
+    _check("threshold", threshold, threshold > 0 and np.isfinite(threshold), "finite, above 0")
+    _check("confidence", confidence, 0 < confidence < 1, "between 0 and 1, both excluded")
+    _check("max_iters", max_iters, max_iters >= 1, "at least 1")
+    _check("density", density, density in ("contrast", "paper", "off"), "contrast, paper or off")
+    _check("alpha", alpha, 0 <= alpha <= 1, "from 0 to 1")
+    _check("dc_percent", dc_percent, 0 < dc_percent <= 100, "above 0, at most 100")
+    is_seed = isinstance(random_state, Integral) and 0 <= random_state < 2**31
+    _check("random_state", random_state, is_seed, "an integer from 0 to 2^31 - 1")
     return run(
-        np.ascontiguousarray(X),
-        Robust(method_flag(method), threshold, confidence, max_iters),
-        density=density, alpha=alpha, dc_percent=dc_percent,
-        scores=None if scores is None else np.asarray(scores, float), seed=random_state,
+        np.hstack([first, second]),
+        Robust(method_flag(method), float(threshold), float(confidence), int(max_iters)),
+        density=density,
+        alpha=alpha,
+        dc_percent=dc_percent,
+        scores=trust,
+        seed=int(random_state),
     )
+
+
+def _points(points: ArrayLike, name: str) -> NDArray[np.float64]:
+    array = np.asarray(points, dtype=np.float64)
+    if array.ndim == 3 and 1 in array.shape[:2] and array.shape[2] == 2:
+        array = array.reshape(-1, 2)
+    if array.ndim != 2 or array.shape[1] != 2:
+        raise ValueError(f"{name} has shape {array.shape}; it must be (n, 2): one x, y a row")
+    return array
+
+
+def _check(name: str, value: object, holds: bool | np.bool_, wanted: str) -> None:
+    if not holds:
+        raise ValueError(f"{name} is {value!r}; it must be {wanted}")
