@@ -290,6 +290,8 @@ def _draw_errors(ax: Any, rows: Rows) -> None:
 
 
 def _draw_time(ax: Any, rows: Rows) -> None:
+    from matplotlib.ticker import LogLocator, NullLocator
+
     by_method = _by_method(rows)
     styles = _styles(list(by_method))
     for method, own in by_method.items():
@@ -306,8 +308,9 @@ def _draw_time(ax: Any, rows: Rows) -> None:
             label=f"{s['lost']:.3f}  {method}",
         )
     ax.set_xscale("log")
+    ax.xaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7)))
     ax.xaxis.set_major_formatter("{x:g}")
-    ax.xaxis.set_minor_formatter(lambda x, _: f"{x:g}" if f"{x:g}"[0] in "25" else "")
+    ax.xaxis.set_minor_locator(NullLocator())
     ax.set_xlabel("mean time per call, ms")
     ax.set_ylabel("mean average accuracy")
     ax.grid(color="0.9")

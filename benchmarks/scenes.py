@@ -41,7 +41,9 @@ class Kind:
     motion : {"sideways", "forward", "none"}
         Of the second camera; "none" only turns it.
     coherent : float
-        Share of the wrong matches that pair the wall with itself one period further down.
+        Share of the wrong matches that pair the wall with itself one period further down. An F
+        with its epipole in that direction explains them together with the true ones on the wall;
+        few enough are on it that the truth still has the majority.
     unique : bool
         Whether the matches fix F. If not, any F that explains them is right.
     """
@@ -58,7 +60,7 @@ KINDS: dict[str, Kind] = {
     "clusters": Kind("textured patches at many depths before a wall"),
     "dominant_plane": Kind("90 % of the true matches on one wall", wall=0.9, truth_wall=0.5),
     "repeated_texture": Kind(
-        "a third of the wrong matches one window too low, all alike", wall=0.5, coherent=1 / 3
+        "a quarter of the wrong matches one window too low, all alike", wall=0.3, coherent=0.25
     ),
     "forward": Kind("the camera moves along its axis", motion="forward"),
     "one_plane": Kind("everything on one wall", wall=1.0, truth_wall=1.0, unique=False),
@@ -127,7 +129,7 @@ def make_scene(kind: str, n: int, inlier_ratio: float, noise: float, seed: int =
     true = world.matches(n_true, spec.wall, rng)
     wrong = rng.uniform(0, np.tile(SIZE, 2), (n - n_true - n_coherent, 4))
     coherent = world.matches(n_coherent, 1.0, rng, period=PERIOD)
-    X = np.vstack([true + rng.normal(0, noise, true.shape), wrong, coherent])
+    X = np.vstack([*(x + rng.normal(0, noise, x.shape) for x in (true, coherent)), wrong])
     # SIFT ratios: true matches are lower, with a wide overlap.
     ratio = np.concatenate([rng.beta(5, 3, n_true), rng.beta(12, 2, n - n_true)])
     order = rng.permutation(n)

