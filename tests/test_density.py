@@ -77,6 +77,26 @@ def test_labels_and_halo_are_the_definition(X, block, percent, data):
     assert halo == reference.halo(X.tolist(), peaks.rho.tolist(), labels, peaks.dc)
 
 
+@given(X=lattice, block=blocks, dc=st.integers(1, 6).map(lambda s: float(np.sqrt(s))))
+def test_the_border_of_a_halo_is_strictly_nearer_than_dc(X, block, dc):
+    labels = np.arange(len(X)) % 3
+    peaks = density_peaks(X, dc=dc)
+    with mock.patch.object(_density, "_BLOCK", block):
+        halo = peaks.halo(labels).tolist()
+    assert halo == reference.halo(X.tolist(), peaks.rho.tolist(), labels.tolist(), dc)
+
+
+def test_ties_beyond_the_first_neighbors():
+    """On a lattice more points are equally far than a neighbour list holds."""
+    X = np.stack(np.meshgrid(*[np.arange(6.0)] * 3), axis=-1).reshape(-1, 3)
+    X = np.random.default_rng(0).permutation(X)
+    peaks = peaks_of(X, block=1, dc=0.5)
+    assert (peaks.rho == 0).all()
+    delta, predecessor = reference.delta_and_predecessor(X.tolist(), peaks.rho.tolist())
+    assert peaks.predecessor.tolist() == predecessor
+    assert peaks.delta.tolist() == delta
+
+
 @given(X=points, alpha=st.floats(0, 1))
 def test_centers(X, alpha):
     peaks = density_peaks(X)

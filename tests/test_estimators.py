@@ -229,6 +229,25 @@ def test_residuals_are_pixels(method, expected):
     np.testing.assert_allclose(estimator.score_samples(off), -expected, rtol=1e-3)
 
 
+def test_eight_points_obey_the_threshold(scene):
+    """cv2 has no rule for FM_8POINT."""
+    X = scene.X[scene.inliers]
+    estimator = FundamentalMatrixEstimator(None, method="8point", threshold=0.7).fit(X)
+    ransac = FundamentalMatrixEstimator(None, method="ransac").fit(X)
+    ransac.F_ = estimator.F_
+    assert estimator.threshold_ == 0.7
+    np.testing.assert_array_equal(estimator.inlier_mask_, ransac.score_samples(X) >= -0.7)
+
+
+def test_the_epipole_is_no_inlier(scene):
+    estimator = FundamentalMatrixEstimator().fit(scene.X)
+    estimator.F_ = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 0]])
+    at_epipole = np.zeros((1, 4))
+    assert not estimator.predict(at_epipole).any()
+    assert estimator.score_samples(at_epipole) == -np.inf
+    assert estimator.score(at_epipole) == 0
+
+
 @pytest.mark.parametrize("method", ["lmeds", "usac_magsac"])
 def test_a_row_is_judged_alone(scene, method):
     """LMEDS takes its scale from the rows of fit, so that one new row has an answer too."""
@@ -399,16 +418,20 @@ def test_what_is_kept_is_purer():
     assert scene.inliers[kept].mean() > 2 * scene.inliers.mean()
 
 
-def test_weights_reorder_and_keep_the_number(scene):
-    plain = DensityPeaksFilter().fit(scene.X)
-    trusted = DensityPeaksFilter().fit(scene.X, sample_weight=scene.inliers.astype(float))
-    assert trusted.support_.sum() == plain.support_.sum()
+def test_weights_reorder_and_keep_the_number():
+    scene = two_view_scene(300, inlier_ratio=0.1)
+    plain = DensityPeaksFilter(keep=0.1).fit(scene.X)
+    trusted = DensityPeaksFilter(keep=0.1).fit(scene.X, sample_weight=scene.inliers.astype(float))
+    assert trusted.support_.sum() == plain.support_.sum() == 30
     assert scene.inliers[trusted.support_].mean() > scene.inliers[plain.support_].mean()
     assert trusted.reliability_.min() >= 0
     assert trusted.reliability_.max() <= 1
+    by_rule = DensityPeaksFilter().fit(scene.X)
     equal = DensityPeaksFilter().fit(scene.X, sample_weight=np.full(len(scene.X), 5.0))
+    assert equal.support_.sum() == by_rule.support_.sum()
     np.testing.assert_array_equal(
-        np.argsort(equal.reliability_, kind="stable"), np.argsort(plain.reliability_, kind="stable")
+        np.argsort(equal.reliability_, kind="stable"),
+        np.argsort(by_rule.reliability_, kind="stable"),
     )
 
 
