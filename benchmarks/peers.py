@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -19,13 +19,17 @@ from benchmarks.data import Pair
 from benchmarks.lpm import locality_preserving_matches
 from benchmarks.metrics import usable
 from cv_densityf import _engine
-from cv_densityf._estimate import estimate_fundamental
+from cv_densityf._epipolar import Frame, polish
+from cv_densityf.cv2_api import findFundamentalMat
 
 Floats = NDArray[np.float64]
 Matches = tuple[Floats, Floats | None]
+Density = Literal["contrast", "paper"]
 
 #: With fewer matches left a filter is ignored.
 MIN_FILTERED = 15
+#: Width of the polish's weights, in thresholds, and its steps: the best of a few tried.
+POLISH_SCALE, POLISH_STEPS = 0.7, 8
 #: cv2's graph cut dies on more points than about this (OpenCV 5.0).
 MAX_GRAPH_CUT = 30_000
 
@@ -83,6 +87,10 @@ def _cv2_method(flag: int) -> Estimator:
         return _cv2(X, flag, s)
 
     return estimate
+
+
+def _cv2_magsac(X: Floats, s: Settings) -> Floats | None:
+    return _cv2(X, cv2.USAC_MAGSAC, s)
 
 
 def _cv2_prosac_magsac(X: Floats, s: Settings) -> Floats | None:
@@ -191,20 +199,33 @@ def _filtered(
     return estimate
 
 
-def _ours(flag: int, with_scores: bool, density: str = "contrast") -> Estimator:
+def _polished(estimate: Estimator) -> Estimator:
+    """Refine what another estimator found on all matches, as ours refines its candidates."""
+
+    def estimate_and_polish(pair: Pair, s: Settings) -> Floats | None:
+        F = estimate(pair, s)
+        if F is None:
+            return None
+        frame = Frame(pair.X)
+        scales = [POLISH_SCALE * s.threshold] * POLISH_STEPS
+        return usable(frame.leave(polish(frame, frame.enter(F[None]), scales))[0])
+
+    return estimate_and_polish
+
+
+def _ours(flag: int, with_scores: bool, density: Density = "contrast") -> Estimator:
     def estimate(pair: Pair, s: Settings) -> Floats | None:
         X, scores = _in_score_order(pair) if flag == cv2.USAC_PROSAC else (pair.X, pair.scores)
-        return estimate_fundamental(
-            X[:, :2],
-            X[:, 2:],
-            method=flag,
-            threshold=s.threshold,
-            confidence=s.confidence,
-            max_iters=s.max_iters,
+        F, _ = findFundamentalMat(
+            *_split(X),
+            flag,
+            s.threshold,
+            s.confidence,
+            s.max_iters,
             density=density,
             scores=scores if with_scores else None,
-            random_state=s.seed,
-        ).F
+        )
+        return usable(F)
 
     return estimate
 
@@ -225,9 +246,8 @@ def _all_methods() -> list[Method]:
     methods = []
     for name in CV2_METHODS:
         flag = getattr(cv2, name)
-        prosac = flag == cv2.USAC_PROSAC
-        methods.append(Method(f"cv2:{name}", _cv2_method(flag), uses_scores=prosac))
-    magsac = cv2.USAC_MAGSAC
+        in_order = flag == cv2.USAC_PROSAC
+        methods.append(Method(f"cv2:{name}", _cv2_method(flag), uses_scores=in_order))
     methods += [
         Method(
             "cv2:PROSAC+MAGSAC",
@@ -244,18 +264,24 @@ def _all_methods() -> list[Method]:
         Method("pycolmap", lambda pair, s: _pycolmap(pair.X, s), "pycolmap"),
         Method("pydegensac", lambda pair, s: _pydegensac(pair.X, s), "pydegensac"),
         Method("pymagsac", _pymagsac, "pymagsac"),
-        Method("gms>USAC_MAGSAC", _filtered(_gms, lambda X, s: _cv2(X, magsac, s))),
-        Method("lpm>USAC_MAGSAC", _filtered(_lpm, lambda X, s: _cv2(X, magsac, s))),
-        Method(
-            "lpm>PROSAC+MAGSAC",
-            _filtered(_lpm, _cv2_prosac_magsac, in_order=True),
-            uses_scores=True,
-        ),
+    ]
+    gms = _filtered(_gms, _cv2_magsac)
+    lpm = _filtered(_lpm, _cv2_magsac)
+    lpm_prosac = _filtered(_lpm, _cv2_prosac_magsac, in_order=True)
+    methods += [
+        Method("gms>USAC_MAGSAC", gms),
+        Method("lpm>USAC_MAGSAC", lpm),
+        Method("lpm>PROSAC+MAGSAC", lpm_prosac, uses_scores=True),
+        # What the polish alone is worth, and the filters with it.
+        Method("cv2:USAC_ACCURATE>polish", _polished(_cv2_method(cv2.USAC_ACCURATE))),
+        Method("gms>USAC_MAGSAC>polish", _polished(gms)),
+        Method("lpm>USAC_MAGSAC>polish", _polished(lpm)),
+        Method("lpm>PROSAC+MAGSAC>polish", _polished(lpm_prosac), uses_scores=True),
     ]
     for name in CV2_METHODS:
         flag = getattr(cv2, name)
-        prosac = flag == cv2.USAC_PROSAC
-        methods.append(Method(f"ours:{name}", _ours(flag, False), uses_scores=prosac))
+        in_order = flag == cv2.USAC_PROSAC
+        methods.append(Method(f"ours:{name}", _ours(flag, False), uses_scores=in_order))
         methods.append(Method(f"ours:{name}+scores", _ours(flag, True), uses_scores=True))
     methods.append(Method("ours:FM_RANSAC,paper", _ours(cv2.FM_RANSAC, False, density="paper")))
     return methods
