@@ -225,7 +225,7 @@ def findFundamentalMat(
     n = None if points1 is None or points2 is None else _common_length(points1, points2, usac)
     trust = None if scores is None else _check_scores(scores, n)
     if points1 is None or points2 is None or n is None:
-        return _cv2s_answer(call, usac, args, kwargs)
+        return _cv2s_answer(call, None, usac, args, kwargs)
 
     slot = _mask_slot(call, n, usac)
     ordinary = n >= MIN_FILTERED and _is_ordinary(call)
@@ -233,7 +233,7 @@ def findFundamentalMat(
         if _OPENCV_5 and n > _GRAPH_CUT_MAX and _cuts_graph(call):
             args, kwargs = _without_graph_cut(call), {}
         try:
-            return _cv2s_answer(call, usac, args, kwargs)
+            return _cv2s_answer(call, n, usac, args, kwargs)
         except cv2.error as error:
             if slot is None or not _is_solver_failure(error, call, n, usac):
                 raise
@@ -270,7 +270,8 @@ class _MaskSlot(NamedTuple):
         if self.given is not None:
             self.given.reshape(-1)[:] = mask
             return self.given
-        column = mask.astype(np.uint8).reshape(-1, 1)
+        column = np.empty((len(mask), 1), dtype=np.uint8)
+        column[:, 0] = mask
         return as_umat(column) if self.as_umat else column
 
 
@@ -282,7 +283,7 @@ def _mask_slot(call: Call, n: int, usac: bool) -> _MaskSlot | None:
         return _MaskSlot(None, as_umat)
     if as_umat:
         return None
-    if isinstance(mask, (int, float)):
+    if isinstance(mask, (int, float)) and call.params is None:
         # cv2 takes a number for an array of its own and drops it: the fate of maxIters=1000.0.
         return _MaskSlot(None, False)
     if type(mask) is not np.ndarray or mask.dtype != np.uint8:
@@ -343,19 +344,21 @@ def _without_graph_cut(call: Call) -> tuple[Any, ...]:
     return (*call[:2], params, call.mask)
 
 
-def _cv2s_answer(call: Call, usac: bool, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+def _cv2s_answer(
+    call: Call, n: int | None, usac: bool, args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> Any:
     """Make cv2's own call, and put zeros where it answers with uninitialised memory."""
     F, mask = original(*args, **kwargs)
     if F is not None or mask is None or usac or call.method == cv2.FM_8POINT:
         return F, mask
+    garbage = mask.get() if isinstance(mask, cv2.UMat) else mask
     # Fewer than 7 points leave the mask alone; exactly 7 are all inliers to cv2.
-    if isinstance(mask, cv2.UMat):
-        garbage = mask.get()
-        if garbage.size > 7:
+    if (garbage.size if n is None else n) > 7:
+        if isinstance(mask, cv2.UMat):
             no_mask: Any = None
             cv2.copyTo(as_umat(np.zeros_like(garbage)), no_mask, mask)
-    elif mask.size > 7 and mask.flags.writeable:
-        mask[...] = 0
+        elif mask.flags.writeable:
+            mask[...] = 0
     return F, mask
 
 
@@ -371,7 +374,9 @@ def _is_solver_failure(error: cv2.error, call: Call, n: int, usac: bool) -> bool
 def _no_model(call: Call, n: int, usac: bool, slot: _MaskSlot) -> tuple[None, Any]:
     """Give cv2's answer for "no model found"."""
     if call.params is not None:
-        return None, None
+        if isinstance(call.mask, np.ndarray):
+            call.mask[...] = 0
+        return None, call.mask
     # cv2's direct solvers count every point as an inlier, model or not.
     direct = not usac and (n == 7 or call.method == cv2.FM_8POINT)
     return None, slot.deliver(np.full(n, direct))

@@ -1,0 +1,122 @@
+"""Run the table once for the session, and say at the end what held."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections import Counter
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from compat import implementation, versions
+from compat.cases import CASES
+from compat.differences import differences, is_known, load_known
+from compat.outcomes import observe_both
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--compat-json", metavar="FILE", help="write what held, for `python -m compat.table`"
+    )
+
+
+class Run:
+    """Outcomes of all selected cases, and how they differ."""
+
+    def __init__(self, ids):
+        self.known = load_known()
+        self.ours, self.cv2s = observe_both(ids)
+        self.differences = {
+            id_: differences(CASES[id_], self.ours[id_], self.cv2s[id_]) for id_ in ids
+        }
+
+    def unexpected(self, id_):
+        return {
+            aspect: text
+            for aspect, text in self.differences[id_].items()
+            if is_known(self.known, id_, aspect) is None
+        }
+
+    def by_line(self):
+        """Cases that each line of the known differences covers."""
+        covered = {line: [] for line in self.known if versions.applies(line.condition)}
+        for id_, found in self.differences.items():
+            for aspect in found:
+                line = is_known(self.known, id_, aspect)
+                if line is not None:
+                    covered[line].append(id_)
+        return covered
+
+
+_RUN = pytest.StashKey[Run]()
+
+
+@pytest.fixture(scope="session")
+def run(request):
+    made = Run(request.config.stash[_SELECTED])
+    request.config.stash[_RUN] = made
+    return made
+
+
+_SELECTED = pytest.StashKey[list[str]]()
+
+
+def pytest_collection_modifyitems(session, config, items):
+    """Make only the calls that a selected test looks at."""
+    wanted = {
+        item.callspec.params["id_"]
+        for item in items
+        if hasattr(item, "callspec") and "id_" in item.callspec.params
+    }
+    if any(item.get_closest_marker("whole_table") for item in items):
+        wanted = set(CASES)
+    config.stash[_SELECTED] = [id_ for id_ in CASES if id_ in wanted]
+
+
+def pytest_configure(config):
+    config.addinivalue_line("markers", "whole_table: needs the outcome of every case")
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    made = config.stash.get(_RUN, None)
+    if made is None:
+        return
+    total = len(made.differences)
+    unexpected = {id_: made.unexpected(id_) for id_ in made.differences if made.unexpected(id_)}
+    known = {line: ids for line, ids in made.by_line().items() if ids}
+    n_known = len({id_ for ids in known.values() for id_ in ids} - set(unexpected))
+    write = terminalreporter.write_line
+    terminalreporter.section("compat")
+    write(f"{implementation.NAME} against OpenCV {cv2.__version__}")
+    write(f"Python {platform.python_version()}, numpy {np.__version__}, {platform.machine()}")
+    write(
+        f"{total} calls: {total - len(unexpected) - n_known} as cv2, {n_known} known differences, "
+        f"{len(unexpected)} unexpected differences"
+    )
+    groups = Counter(id_.split("/")[0] for id_ in made.differences)
+    write("  " + ", ".join(f"{group} {count}" for group, count in groups.items()))
+    for line, ids in known.items():
+        write(f"known, {len(ids)} calls, OpenCV issue {line.issue}: {line.reason}")
+        for id_ in ids[:100]:
+            write(f"    {id_} [{line.aspect}]")
+    for id_, found in unexpected.items():
+        for aspect, text in found.items():
+            write(f"UNEXPECTED {id_} [{aspect}] {text}")
+    target = config.getoption("--compat-json")
+    if target:
+        failed = len(terminalreporter.stats.get("failed", []))
+        record = {
+            "implementation": implementation.NAME,
+            "opencv": cv2.__version__,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+            "calls": total,
+            "known": n_known,
+            "unexpected": len(unexpected),
+            "tests": len(terminalreporter.stats.get("passed", [])),
+            "failed": failed,
+        }
+        Path(target).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
