@@ -315,6 +315,7 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
             if sample_weight is None
             else _check_sample_weight(sample_weight, matches, dtype=np.float64)
         )
+        reliability: NDArray[np.floating]
         if n < MIN_FILTERED:
             reliability, support = np.ones(n), np.ones(n, dtype=bool)
         elif self.rule == "contrast":
@@ -691,7 +692,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         return np.where(np.isnan(distance), np.inf, distance)
 
 
-def _ranks(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _ranks(values: NDArray[np.floating]) -> NDArray[np.float64]:
     """Ranks in [0, 1], 1 for the largest; equal values share theirs."""
     return np.asarray((rankdata(values) - 1) / max(len(values) - 1, 1))
 
