@@ -272,10 +272,12 @@ def _run_match(options: argparse.Namespace) -> int:
         with _stage("matching", timings):
             matches = match_features(*features, ratio=options.ratio)
         X, scores = matches.X, matches.scores
-    if len(X) < _MIN_MATCHES:
+    n_finite = int(np.isfinite(X).all(axis=1).sum())
+    if n_finite < _MIN_MATCHES:
+        count = f"{n_finite} matches" if n_finite == len(X) else f"{n_finite} finite matches"
         raise InputError(
-            f"{options.points or ' and '.join(options.images)}: {len(X)} matches, a fundamental "
-            f"matrix needs at least {_MIN_MATCHES}"
+            f"{options.points or ' and '.join(options.images)}: {count}, a fundamental matrix "
+            f"needs at least {_MIN_MATCHES}"
         )
 
     robust = Robust(

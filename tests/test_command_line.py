@@ -262,6 +262,7 @@ class TestNoF:
         (["match", "--points", "{here}/no.npz"], "no.npz: No such file"),
         (["match", "--points", "{here}/text.csv"], "text.csv: header 'hello' is not"),
         (["match", "--points", "{here}/seven.csv"], "seven.csv: 7 matches, .* at least 8"),
+        (["match", "--points", "{here}/nan.csv"], "nan.csv: 7 finite matches, .* at least 8"),
         (["match", "--points", "{npz}", "a.png", "b.png"], "--points and images exclude"),
         (["match", "--points", "{npz}", "--ratio", "0.8"], "--points and --ratio exclude"),
         (["match", "--points", "{npz}", "--max-size", "9"], "--points and --max-size exclude"),
@@ -284,6 +285,11 @@ class TestNoF:
 def test_wrong_use(run, npz, tmp_path, arguments, message):
     (tmp_path / "text.csv").write_text("hello\n")
     np.savetxt(tmp_path / "seven.csv", SCENE.X[:7], delimiter=",")
+    np.savetxt(
+        tmp_path / "nan.csv",
+        np.pad(SCENE.X[:7], ((0, 3), (0, 0)), constant_values=np.nan),
+        delimiter=",",
+    )
     cv2.imwrite(str(tmp_path / "black.png"), np.zeros((50, 60), np.uint8))
     before = {path.name for path in tmp_path.iterdir()}
     code, out, err = run(*(text.format(here=tmp_path, npz=npz) for text in arguments))
