@@ -164,7 +164,7 @@ def _stages(args: argparse.Namespace) -> int:
                     times[stage][n].append(ms)
     for stage, by_n in times.items():
         print(f"| {stage} | {' | '.join(_median(by_n[n], '.2f') for n in args.n)} |")
-    print(f"| draws | {' | '.join(_median(draws[n], '.0f') for n in args.n)} |")
+    print(f"| number of draws | {' | '.join(_median(draws[n], '.0f') for n in args.n)} |")
     return 0
 
 

@@ -346,4 +346,4 @@ class TestReport:
         assert main(["stages", "--n", "50", "100", "--repeats", "1"]) == 0
         lines = capsys.readouterr().out.splitlines()
         assert lines[0] == "| stage, ms | N = 50 | N = 100 |"
-        assert lines[-1].startswith("| draws |")
+        assert lines[-1].startswith("| number of draws |")
