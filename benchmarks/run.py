@@ -85,7 +85,7 @@ def _timed(
     best = np.inf
     F = None
     for _ in range(max(1, repeats)):
-        # Processor time: on one thread it is what the clock shows, had the machine nothing else to do.
+        # Processor time: on one thread it is the time by the clock of an idle machine.
         start = time.process_time()
         F = method.estimate(pair, settings)
         best = min(best, 1e3 * (time.process_time() - start))
