@@ -16,10 +16,6 @@ READS_UINT32_AND_BOOL = OPENCV >= (5, 0)
 REFUSES_READ_ONLY_MASK = OPENCV >= (4, 9)
 #: A bool array as ``mask`` is an error; since, it is ignored.
 REFUSES_BOOL_MASK = OPENCV < (5, 0)
-#: The classic solvers raise on every degenerate sample of seven points (OpenCV pull 28361).
-RAISES_ON_DEGENERATE_SAMPLES = OPENCV == (4, 13)
-#: USAC takes a third image axis of numbers, (1, 2, N), for transposed points.
-USAC_READS_FLAT_TRANSPOSED = OPENCV < (5, 0)
 #: Graph cut runs out of memory or kills the process from some 49,000 points on.
 GRAPH_CUT_DIES = OPENCV >= (5, 0)
 #: The stub that comes with cv2 lists the overloads.

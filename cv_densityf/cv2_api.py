@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, NamedTuple, overload
+from typing import Any, NamedTuple, overload
 
 import cv2
 import numpy as np
@@ -11,11 +11,9 @@ from cv2.typing import MatLike
 from numpy.typing import ArrayLike, NDArray
 
 from cv_densityf._engine import Robust, is_usac, original
-from cv_densityf._estimate import MIN_FILTERED, run
+from cv_densityf._estimate import MIN_FILTERED, Density, Estimate, run
 from cv_densityf._overloads import Call, resolve
 from cv_densityf._points import as_array, as_matches, as_umat, n_points
-
-Density = Literal["contrast", "paper", "off"]
 
 _OPENCV_5 = int(cv2.__version__.split(".")[0]) >= 5
 
@@ -117,7 +115,7 @@ def findFundamentalMat(
 ) -> tuple[MatLike, cv2.UMat]: ...
 def findFundamentalMat(
     *args: Any,
-    density: str = "contrast",
+    density: Density = "contrast",
     alpha: float = 0.011,
     dc_percent: float = 2.0,
     scores: ArrayLike | None = None,
@@ -216,16 +214,28 @@ def findFundamentalMat(
     >>> F.shape, mask.shape, int(mask.sum())
     ((3, 3), (100, 1), 100)
     """
+    return find(args, kwargs, density, alpha, dc_percent, scores)[0]
+
+
+def find(
+    args: tuple[Any, ...],
+    kwargs: dict[str, Any],
+    density: Density = "contrast",
+    alpha: float = 0.011,
+    dc_percent: float = 2.0,
+    scores: ArrayLike | None = None,
+) -> tuple[Any, Estimate | None]:
+    """Answer a call of cv2's function, and say how: None where the answer is cv2's own."""
     _check_options(density, alpha, dc_percent)
     call = resolve(args, kwargs)
     if call is None:
-        return original(*args, **kwargs)
+        return original(*args, **kwargs), None
     usac = call.params is not None or is_usac(call.method)
     points1, points2 = as_array(call.points1), as_array(call.points2)
     n = None if points1 is None or points2 is None else _common_length(points1, points2, usac)
     trust = None if scores is None else _check_scores(scores, n)
     if points1 is None or points2 is None or n is None:
-        return _cv2s_answer(call, None, usac, args, kwargs)
+        return _cv2s_answer(call, None, usac, args, kwargs), None
 
     slot = _mask_slot(call, n, usac)
     ordinary = n >= MIN_FILTERED and _is_ordinary(call)
@@ -233,12 +243,12 @@ def findFundamentalMat(
         if _OPENCV_5 and n > _GRAPH_CUT_MAX and _cuts_graph(call):
             args, kwargs = _without_graph_cut(call), {}
         try:
-            return _cv2s_answer(call, n, usac, args, kwargs)
+            return _cv2s_answer(call, n, usac, args, kwargs), None
         except cv2.error as error:
             if slot is None or not _is_solver_failure(error, call, n, usac):
                 raise
         if not ordinary:
-            return _no_model(call, n, usac, slot)
+            return _no_model(call, n, usac, slot), None
     estimate = run(
         as_matches(points1, points2, n, usac),
         Robust(
@@ -256,8 +266,9 @@ def findFundamentalMat(
         seed=0 if call.params is None else call.params.randomGeneratorState,
     )
     if estimate.F is None:
-        return _no_model(call, n, usac, slot)
-    return np.array(estimate.F, dtype=np.float64, order="C"), slot.deliver(estimate.mask)
+        return _no_model(call, n, usac, slot), estimate
+    F = np.array(estimate.F, dtype=np.float64, order="C")
+    return (F, slot.deliver(estimate.mask)), estimate
 
 
 class _MaskSlot(NamedTuple):
