@@ -226,7 +226,7 @@ def find(
     scores: ArrayLike | None = None,
 ) -> tuple[Any, Estimate | None]:
     """Answer a call of cv2's function, and say how: None where the answer is cv2's own."""
-    _check_options(density, alpha, dc_percent)
+    check_options(density, alpha, dc_percent)
     call = resolve(args, kwargs)
     if call is None:
         return original(*args, **kwargs), None
@@ -393,7 +393,8 @@ def _no_model(call: Call, n: int, usac: bool, slot: _MaskSlot) -> tuple[None, An
     return None, slot.deliver(np.full(n, direct))
 
 
-def _check_options(density: str, alpha: float, dc_percent: float) -> None:
+def check_options(density: str, alpha: float, dc_percent: float) -> None:
+    """Raise ValueError, with what to do, for options out of range."""
     if density not in ("contrast", "paper", "off"):
         raise ValueError(f"density must be 'contrast', 'paper' or 'off', not {density!r}")
     if not 0 <= alpha < math.inf:

@@ -1,0 +1,229 @@
+"""Put `cv_densityf.findFundamentalMat` in the place of cv2's function, and take it back.
+
+For programs that cannot be edited. What was imported by name before the patch
+(``from cv2 import findFundamentalMat``) keeps cv2's function, and so do other processes: worker
+processes that import cv2 afresh have to patch it themselves; threads share the patch.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+
+from cv_densityf import cv2_api
+from cv_densityf._engine import original
+from cv_densityf._estimate import Density, Estimate
+
+
+@dataclass(frozen=True)
+class CallSite:
+    """What the patched function did for one line of a program.
+
+    Attributes
+    ----------
+    filename : str
+        File of the calling line.
+    line : int
+        Its number.
+    calls : int
+        Calls that came from there, errors included.
+    passed_on : int
+        Calls that were cv2's own: see `cv_densityf.findFundamentalMat` for which.
+    errors : int
+        Calls that raised.
+    no_model : int
+        Calls, not passed on, that found no fundamental matrix.
+    kept, dropped : int
+        Matches that hypotheses were drawn from, and the rest, over all calls not passed on.
+    """
+
+    filename: str
+    line: int
+    calls: int = 0
+    passed_on: int = 0
+    errors: int = 0
+    no_model: int = 0
+    kept: int = 0
+    dropped: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class _Patch:
+    """Options of one `patch_cv2` or `patched`; compared by identity."""
+
+    density: Density
+    alpha: float
+    dc_percent: float
+
+
+_lock = threading.RLock()
+#: The last one counts. `patch_cv2` has at most one in it, every open `patched` has its own.
+_patches: list[_Patch] = []
+_lasting: _Patch | None = None
+_before: Any = original
+_sites: dict[tuple[str, int], CallSite] = {}
+
+
+def findFundamentalMat(*args: Any, **kwargs: Any) -> Any:
+    """Stand in for cv2's function as long as a patch is in force."""
+    with _lock:
+        patch = _patches[-1] if _patches else None
+    if patch is None:  # somebody kept this function beyond the patch
+        return original(*args, **kwargs)
+    caller = sys._getframe(1)
+    site = caller.f_code.co_filename, caller.f_lineno
+    # The extras are no parameters of cv2's function, but a patched program may know of us.
+    options: dict[str, Any] = {
+        "density": patch.density,
+        "alpha": patch.alpha,
+        "dc_percent": patch.dc_percent,
+    }
+    for name in ("density", "alpha", "dc_percent", "scores"):
+        if name in kwargs:
+            options[name] = kwargs.pop(name)
+    try:
+        answer, estimate = cv2_api.find(args, kwargs, **options)
+    except BaseException:
+        _count(site, None, failed=True)
+        raise
+    _count(site, estimate)
+    return answer
+
+
+findFundamentalMat.__doc__ = cv2_api.findFundamentalMat.__doc__
+
+
+def _count(site: tuple[str, int], estimate: Estimate | None, failed: bool = False) -> None:
+    kept = 0 if estimate is None else int(estimate.kept.sum())
+    n = 0 if estimate is None else len(estimate.kept)
+    with _lock:
+        old = _sites.get(site) or CallSite(*site)
+        _sites[site] = replace(
+            old,
+            calls=old.calls + 1,
+            passed_on=old.passed_on + (estimate is None and not failed),
+            errors=old.errors + failed,
+            no_model=old.no_model + (estimate is not None and estimate.F is None),
+            kept=old.kept + kept,
+            dropped=old.dropped + n - kept,
+        )
+
+
+def patch_cv2(
+    *, density: Density = "contrast", alpha: float = 0.011, dc_percent: float = 2.0
+) -> None:
+    """Replace ``cv2.findFundamentalMat`` until `unpatch_cv2`.
+
+    A second call replaces the options of the first; one `unpatch_cv2` ends both.
+
+    Parameters
+    ----------
+    density, alpha, dc_percent
+        As in `cv_densityf.findFundamentalMat`, for all calls.
+
+    Raises
+    ------
+    ValueError
+        For options that `cv_densityf.findFundamentalMat` refuses.
+
+    Examples
+    --------
+    >>> import cv2
+    >>> from cv_densityf.patching import is_patched, patch_cv2, unpatch_cv2
+    >>> patch_cv2()
+    >>> is_patched()
+    True
+    >>> unpatch_cv2()
+    >>> is_patched()
+    False
+    """
+    global _lasting
+    patch = _checked(density, alpha, dc_percent)
+    with _lock:
+        if _lasting is not None:
+            _patches.remove(_lasting)
+        _lasting = patch
+        _patches.append(patch)
+        _install()
+
+
+def unpatch_cv2() -> None:
+    """Undo `patch_cv2`; without one, do nothing. An open `patched` stays in force."""
+    global _lasting
+    with _lock:
+        if _lasting is not None:
+            _patches.remove(_lasting)
+            _lasting = None
+        _uninstall()
+
+
+def is_patched() -> bool:
+    """Whether ``cv2.findFundamentalMat`` is ours at the moment."""
+    return cv2.findFundamentalMat is findFundamentalMat
+
+
+@contextmanager
+def patched(
+    *, density: Density = "contrast", alpha: float = 0.011, dc_percent: float = 2.0
+) -> Iterator[None]:
+    """Replace ``cv2.findFundamentalMat`` inside a ``with`` block, for all threads.
+
+    Blocks may be nested and may overlap between threads: the options of the one entered last are
+    in force, and cv2's function is back when the last one is left.
+
+    Parameters
+    ----------
+    density, alpha, dc_percent
+        As in `cv_densityf.findFundamentalMat`.
+
+    Raises
+    ------
+    ValueError
+        For options that `cv_densityf.findFundamentalMat` refuses.
+    """
+    patch = _checked(density, alpha, dc_percent)
+    with _lock:
+        _patches.append(patch)
+        _install()
+    try:
+        yield
+    finally:
+        with _lock:
+            _patches.remove(patch)
+            _uninstall()
+
+
+def call_sites() -> list[CallSite]:
+    """Count what the patched function did, most calls first, since `reset_call_sites`."""
+    with _lock:
+        return sorted(_sites.values(), key=lambda site: -site.calls)
+
+
+def reset_call_sites() -> None:
+    """Forget all counts."""
+    with _lock:
+        _sites.clear()
+
+
+def _checked(density: Density, alpha: float, dc_percent: float) -> _Patch:
+    cv2_api.check_options(density, alpha, dc_percent)
+    return _Patch(density, alpha, dc_percent)
+
+
+def _install() -> None:
+    global _before
+    if not is_patched():
+        _before = cv2.findFundamentalMat
+        setattr(cv2, "findFundamentalMat", findFundamentalMat)  # noqa: B010 - a function to mypy
+
+
+def _uninstall() -> None:
+    # If somebody has patched over us, theirs stays; ours passes calls on to cv2 from now on.
+    if not _patches and is_patched():
+        setattr(cv2, "findFundamentalMat", _before)  # noqa: B010

@@ -1,0 +1,220 @@
+"""Patching cv2 changes what programs call, and nothing stays behind."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import cv2
+import numpy as np
+import pytest
+
+from cv_densityf import findFundamentalMat
+from cv_densityf._engine import original
+from cv_densityf.datasets import two_view_scene
+from cv_densityf.patching import (
+    call_sites,
+    is_patched,
+    patch_cv2,
+    patched,
+    reset_call_sites,
+    unpatch_cv2,
+)
+
+SCENE = two_view_scene(200, inlier_ratio=0.4, random_state=3)
+P1, P2 = SCENE.points1, SCENE.points2
+
+
+@pytest.fixture(autouse=True)
+def _clean():
+    reset_call_sites()
+    yield
+    unpatch_cv2()
+    assert cv2.findFundamentalMat is original
+
+
+def assert_same(one, two):
+    np.testing.assert_array_equal(one[0], two[0])
+    np.testing.assert_array_equal(one[1], two[1])
+
+
+def test_a_patched_cv2_answers_as_we_do():
+    ours = findFundamentalMat(P1, P2, cv2.USAC_ACCURATE, 1.0)
+    cv2s = original(P1, P2, cv2.USAC_ACCURATE, 1.0)
+    assert not np.array_equal(ours[0], cv2s[0])
+    patch_cv2()
+    assert_same(cv2.findFundamentalMat(P1, P2, cv2.USAC_ACCURATE, 1.0), ours)
+    unpatch_cv2()
+    assert_same(cv2.findFundamentalMat(P1, P2, cv2.USAC_ACCURATE, 1.0), cv2s)
+
+
+def test_options_are_those_of_all_calls():
+    with patched(density="off"):
+        assert_same(cv2.findFundamentalMat(P1, P2, 36), original(P1, P2, 36))
+        # Unless a call has its own.
+        assert_same(
+            cv2.findFundamentalMat(P1, P2, 36, density="contrast"), findFundamentalMat(P1, P2, 36)
+        )
+    with patched(density="paper", alpha=0.05, dc_percent=4.0):
+        expected = findFundamentalMat(P1, P2, 36, density="paper", alpha=0.05, dc_percent=4.0)
+        assert_same(cv2.findFundamentalMat(P1, P2, 36), expected)
+
+
+@pytest.mark.parametrize("patch", [patch_cv2, lambda **options: patched(**options).__enter__()])
+def test_wrong_options_patch_nothing(patch):
+    with pytest.raises(ValueError, match="density must be"):
+        patch(density="dense")
+    assert not is_patched()
+
+
+def test_patching_twice_needs_one_undoing():
+    patch_cv2()
+    patch_cv2(density="off")
+    assert is_patched()
+    assert_same(cv2.findFundamentalMat(P1, P2, 36), original(P1, P2, 36))
+    unpatch_cv2()
+    assert not is_patched()
+    unpatch_cv2()
+    assert cv2.findFundamentalMat is original
+
+
+def test_blocks_nest():
+    with patched():
+        with patched(density="off"):
+            assert_same(cv2.findFundamentalMat(P1, P2, 36), original(P1, P2, 36))
+        assert_same(cv2.findFundamentalMat(P1, P2, 36), findFundamentalMat(P1, P2, 36))
+        unpatch_cv2()
+        assert is_patched()
+    assert not is_patched()
+
+
+def test_a_block_inside_a_lasting_patch():
+    patch_cv2(density="off")
+    with patched():
+        assert_same(cv2.findFundamentalMat(P1, P2, 36), findFundamentalMat(P1, P2, 36))
+    assert is_patched()
+    assert_same(cv2.findFundamentalMat(P1, P2, 36), original(P1, P2, 36))
+
+
+def test_an_error_leaves_the_block_unpatched():
+    with pytest.raises(cv2.error, match="Overload resolution failed"), patched():
+        cv2.findFundamentalMat(P1)
+    assert not is_patched()
+
+
+def test_blocks_overlap_between_threads():
+    inside, leave = threading.Event(), threading.Event()
+
+    def other():
+        with patched():
+            inside.set()
+            leave.wait(10)
+
+    thread = threading.Thread(target=other)
+    with patched(density="off"):
+        thread.start()
+        inside.wait(10)
+    # The block entered first is left first: the other thread's is still in force.
+    assert is_patched()
+    leave.set()
+    thread.join()
+    assert not is_patched()
+
+
+def test_threads_calling_and_patching_at_once():
+    expected = findFundamentalMat(P1, P2, 38)
+
+    def work(_):
+        with patched():
+            return cv2.findFundamentalMat(P1, P2, 38)
+
+    with ThreadPoolExecutor(4) as pool:
+        for answer in pool.map(work, range(24)):
+            assert_same(answer, expected)
+    assert not is_patched()
+    assert sum(site.calls for site in call_sites()) == 24
+
+
+def test_somebody_elses_patch_survives(monkeypatch):
+    def spy(*args, **kwargs):
+        return ours(*args, **kwargs)
+
+    patch_cv2()
+    ours = cv2.findFundamentalMat
+    monkeypatch.setattr(cv2, "findFundamentalMat", spy)
+    unpatch_cv2()
+    assert cv2.findFundamentalMat is spy
+    # Our function, wrapped in theirs, is cv2's again.
+    assert_same(cv2.findFundamentalMat(P1, P2, 36), original(P1, P2, 36))
+    monkeypatch.setattr(cv2, "findFundamentalMat", original)
+
+
+def test_an_earlier_patch_comes_back(monkeypatch):
+    def spy(*args, **kwargs):
+        raise AssertionError("never called")
+
+    monkeypatch.setattr(cv2, "findFundamentalMat", spy)
+    with patched():
+        # The pipeline calls cv2's function as it was at import, so nothing recurses.
+        assert cv2.findFundamentalMat(P1, P2, 36)[0] is not None
+    assert cv2.findFundamentalMat is spy
+    monkeypatch.undo()
+
+
+def test_counts_per_calling_line():
+    with patched():
+        for _ in range(3):
+            cv2.findFundamentalMat(P1, P2, 36)
+        cv2.findFundamentalMat(P1, P2, cv2.FM_8POINT)
+        cv2.findFundamentalMat(P1 * np.nan, P2, 36)
+        with pytest.raises(cv2.error):
+            cv2.findFundamentalMat(P1.tolist(), P2)
+    sites = call_sites()
+    assert [site.calls for site in sites] == [3, 1, 1, 1]
+    assert {site.filename for site in sites} == {__file__}
+    first, eight_point, nan, refused = sorted(sites, key=lambda site: site.line)
+    assert (first.passed_on, first.no_model, first.errors) == (0, 0, 0)
+    assert first.kept + first.dropped == 600
+    assert 0 < first.kept < 600
+    assert (eight_point.passed_on, eight_point.kept) == (1, 0)
+    assert (nan.passed_on, nan.no_model) == (0, 1)
+    assert (refused.passed_on, refused.errors) == (0, 1)
+    reset_call_sites()
+    assert call_sites() == []
+
+
+def test_looks_like_cv2s_function():
+    with patched():
+        assert cv2.findFundamentalMat.__name__ == "findFundamentalMat"
+        assert "ransacReprojThreshold" in cv2.findFundamentalMat.__doc__
+
+
+def run_python(code):
+    return subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=60
+    )
+
+
+def test_limits_names_imported_before_and_worker_processes():
+    """Both are documented: an earlier import by name and a new process have cv2's function."""
+    done = run_python(
+        """
+        import multiprocessing
+        from cv2 import findFundamentalMat as early
+        from cv_densityf._engine import original
+        from cv_densityf.patching import is_patched, patched
+
+        if __name__ == "__main__":
+            with patched():
+                from cv2 import findFundamentalMat as late
+                assert early is original
+                assert late is not original
+                with multiprocessing.get_context("spawn").Pool(1) as pool:
+                    assert pool.apply(is_patched) is False
+                assert is_patched()
+        """
+    )
+    assert done.returncode == 0, done.stderr
