@@ -12,6 +12,7 @@ from cv_densityf._epipolar import Frame, eight_point, point_line_squared, polish
 from cv_densityf._stopwatch import Stopwatch
 
 Floats = NDArray[np.floating]
+Ints = NDArray[np.intp]
 
 #: Shares of the matches, most reliable first, that hypotheses are drawn from, round by round.
 ROUNDS = ((0.25, 0.5), (1.0, 0.75), (0.125, 0.25), (0.5, 1.0), (0.75, 0.125))
@@ -27,8 +28,12 @@ _VOTE_WIDTHS = np.array([0.3, 0.5, 0.8, 1.3])
 _GRID = 16
 #: Width of the weights in the polish, in units of the working threshold.
 _POLISH_WIDTH = 0.7
-_POLISH_STEPS = 6
-_REFINE_STEPS = 4
+_POLISH_STEPS = 4
+#: The winner's last steps take weights of this many robust standard deviations: nearly all of what
+#: least squares gets out of normal noise, and little of what heavier tails put in.
+_REFINE_SIGMAS = 3.0
+_REFINE_STEPS = 3
+_NARROWEST = 0.1
 #: A working threshold of this many robust standard deviations of the residuals lets nearly every
 #: inlier vote; it never exceeds the caller's threshold and never falls below a part of it.
 _SIGMAS = 4.0
@@ -88,7 +93,7 @@ def search(
     ballot = _Ballot(X, reliability)
     reliable = order[: max(MIN_DRAW, n // 2)]
     working = threshold
-    G = np.empty((0, 3, 3))
+    G: Floats = np.empty((0, 3, 3))
     n_draws = 0
     agreed = False
     for number, fractions in enumerate(ROUNDS):
@@ -124,12 +129,12 @@ def search(
         common = inliers @ inliers[best]
         union = inliers.sum(axis=1) + common[best] - common
         watch.lap("vote")
-        agreed = np.count_nonzero(common >= _AGREEMENT * union) > 1
+        agreed = int(np.count_nonzero(common >= _AGREEMENT * union)) > 1
         if agreed:
             break
     if len(G) == 0:
         return None
-    winner = _refine(frame, G[best : best + 1], squared[best], threshold, working)
+    winner = _refine(frame, G[best : best + 1], squared[best], reliable, threshold)
     watch.lap("polish")
     return Consensus(
         F=np.ascontiguousarray(frame.leave(winner)[0]),
@@ -152,12 +157,11 @@ def _noise(squared: Floats, threshold: float) -> float:
     return sigma
 
 
-def _refine(frame: Frame, G: Floats, squared: Floats, threshold: float, working: float) -> Floats:
-    """Polish the winner at the width of its own residuals."""
+def _refine(frame: Frame, G: Floats, squared: Floats, reliable: Ints, threshold: float) -> Floats:
+    """Polish the winner at the width of its own residuals on the reliable matches."""
     for _ in range(_REFINE_STEPS):
-        weight = 1.0 / (1.0 + squared / (_POLISH_WIDTH * working) ** 2) ** 2
-        spread = 1.4 * float(np.sqrt((weight * squared).sum() / weight.sum()))
-        G = polish(frame, G, [min(max(spread, 0.1 * threshold), threshold)])
+        width = _REFINE_SIGMAS * _noise(squared[reliable], threshold)
+        G = polish(frame, G, [max(width, _NARROWEST * threshold)])
         squared = frame.sampson(G)[0]
     return G
 
@@ -188,7 +192,7 @@ class _Ballot:
         return total
 
 
-def _cells(points: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _cells(points: Floats) -> tuple[Ints, Ints]:
     """Rows sorted by grid cell, and where each occupied cell starts."""
     low = points.min(axis=0)
     side = max(float((points.max(axis=0) - low).max()), 1e-9)
@@ -236,7 +240,7 @@ def eight_point_ransac(
         samples = rng.permuted(np.broadcast_to(np.arange(n), (size, n)), axis=1)[:, :8]
         for F in eight_point(X[samples]):
             drawn += 1
-            inliers = np.count_nonzero(point_line_squared(F, X) <= threshold * threshold)
+            inliers = int(np.count_nonzero(point_line_squared(F, X) <= threshold * threshold))
             if inliers > most:
                 best, most = F, inliers
                 clean = (inliers / n) ** 8

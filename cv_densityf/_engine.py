@@ -34,6 +34,9 @@ METHODS: dict[str, int] = {
     "usac_magsac": cv2.USAC_MAGSAC,
 }
 
+#: cv2's graph cut takes seconds above a few tens of thousands of matches, and OpenCV 5.0 dies.
+GRAPH_CUT_MAX = 30_000
+
 _USAC_FLAGS = range(cv2.USAC_DEFAULT, cv2.USAC_MAGSAC + 1)
 
 
@@ -87,13 +90,22 @@ class Robust:
     def plain(
         self, points1: Any, points2: Any
     ) -> tuple[NDArray[np.float64] | None, NDArray[np.uint8] | None]:
-        """Make cv2's own call; (None, None) where its solver raises or finds nothing."""
+        """Make cv2's own call; (None, None) where its solver raises or finds nothing.
+
+        Where cv2 would cut graphs over more than `GRAPH_CUT_MAX` matches, USAC_DEFAULT answers.
+        """
+        flag, params = self.flag, self.params
+        if len(points1) > GRAPH_CUT_MAX and (
+            flag == cv2.USAC_ACCURATE
+            or (params is not None and params.loMethod == cv2.LOCAL_OPTIM_GC)
+        ):
+            flag, params = cv2.USAC_DEFAULT, None
         try:
-            if self.params is not None:
-                F, mask = original(points1, points2, self.params)
+            if params is not None:
+                F, mask = original(points1, points2, params)
             else:
                 F, mask = original(
-                    points1, points2, self.flag, self.threshold, self.confidence, self.max_iters
+                    points1, points2, flag, self.threshold, self.confidence, self.max_iters
                 )
         except cv2.error:
             return None, None
@@ -124,4 +136,6 @@ def draw(
         F, _ = original(points[:, :2], points[:, 2:], params)
     except cv2.error:
         return None
-    return F if F is not None and np.isfinite(F).all() else None
+    if F is None or not np.isfinite(F).all():
+        return None
+    return np.asarray(F, dtype=np.float64)

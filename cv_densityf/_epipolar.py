@@ -25,10 +25,10 @@ def _sampson_squared(F: Floats, X: Floats) -> Floats:
     x, y, u, v = X.T
     a = F[0, 0] * x + F[0, 1] * y + F[0, 2]
     b = F[1, 0] * x + F[1, 1] * y + F[1, 2]
-    c = F[2, 0] * x + F[2, 1] * y + F[2, 2]
     d = F[0, 0] * u + F[1, 0] * v + F[2, 0]
     e = F[0, 1] * u + F[1, 1] * v + F[2, 1]
-    algebraic = u * a + v * b + c
+    # The order of cv2's sum: the last bit decides ties at the threshold.
+    algebraic = u * a + v * b + F[2, 0] * x + F[2, 1] * y + F[2, 2]
     return algebraic * algebraic / (a * a + b * b + d * d + e * e)
 
 
@@ -43,7 +43,7 @@ def point_line_squared(F: Floats, X: Floats) -> Floats:
     e = F[0, 1] * u + F[1, 1] * v + F[2, 1]
     f = F[0, 2] * u + F[1, 2] * v + F[2, 2]
     in_first = x * d + y * e + f
-    # cv2 multiplies by the reciprocal: the last bit decides ties at the threshold.
+    # cv2 multiplies by the reciprocal.
     return np.maximum(
         in_first * in_first * (1.0 / (d * d + e * e)),
         in_second * in_second * (1.0 / (a * a + b * b)),
@@ -115,7 +115,11 @@ class Frame:
         self.homogeneous1 = np.concatenate([Z[:2], ones])
         self.homogeneous2 = np.concatenate([Z[2:], ones])
         self.products = (self.homogeneous2[:, None] * self.homogeneous1[None]).reshape(9, -1)
-        self.outer = self.products[_ROWS] * self.products[_COLUMNS]
+        self.outer = np.empty((45, len(X)))
+        row = 0
+        for i in range(9):
+            np.multiply(self.products[i], self.products[i:], out=self.outer[row : row + 9 - i])
+            row += 9 - i
         self._first = _centring(centre[:2], self.scale)
         self._second = _centring(centre[2:], self.scale)
 
@@ -153,6 +157,8 @@ _TINY = 1e-300
 _SKEW = np.zeros((3, 3, 3))
 _SKEW[0, 2, 1] = _SKEW[1, 0, 2] = _SKEW[2, 1, 0] = 1.0
 _SKEW[0, 1, 2] = _SKEW[1, 2, 0] = _SKEW[2, 0, 1] = -1.0
+_HALF_SKEW = 0.5 * _SKEW.reshape(3, 9)
+_EYE = np.eye(3)
 
 
 def eight_point(samples: Floats) -> NDArray[np.float64]:
@@ -238,19 +244,21 @@ def polish(frame: Frame, G: Floats, scales: Sequence[float | Floats]) -> Floats:
         half = tangent @ gram
         hessian = half @ tangent.transpose(0, 2, 1)
         gradient = half @ G.reshape(m, 9, 1)
-        damping = 1e-9 * np.trace(hessian, axis1=1, axis2=2) + _TINY
-        hessian += damping[:, None, None] * np.eye(7)
+        damping = 1e-9 * np.einsum("mkk->m", hessian) + _TINY
+        np.einsum("mkk->mk", hessian)[...] += damping[:, None]
         step = -np.linalg.solve(hessian, gradient)[:, :, 0]
-        step *= np.minimum(1.0, 0.5 / (np.linalg.norm(step, axis=1, keepdims=True) + _TINY))
-        U = U @ _rotation(step[:, :3])
-        Vt = _rotation(step[:, 3:6]) @ Vt
+        length = np.sqrt(np.einsum("mk,mk->m", step, step))
+        step *= np.minimum(1.0, 0.5 / (length + _TINY))[:, None]
+        rotation = _rotation(step[:, :6].reshape(-1, 3)).reshape(m, 2, 3, 3)
+        U = U @ rotation[:, 0]
+        Vt = rotation[:, 1] @ Vt
         angle = angle + step[:, 6]
     D[:, 0, 0], D[:, 1, 1] = np.cos(angle), np.sin(angle)
-    return U @ D @ Vt
+    return np.asarray(U @ D @ Vt)
 
 
 def _rotation(axis: Floats) -> Floats:
     """Cayley's rotation for small axis vectors (m, 3); equal to the exponential to second order."""
-    K = 0.5 * np.tensordot(axis, _SKEW, 1)
-    square = (axis * axis).sum(axis=1)[:, None, None]
-    return np.eye(3) + (K + K @ K) * (2.0 / (1.0 + 0.25 * square))
+    K = (axis @ _HALF_SKEW).reshape(-1, 3, 3)
+    shrink = 2.0 / (1.0 + 0.25 * np.einsum("mk,mk->m", axis, axis))
+    return np.asarray(_EYE + (K + K @ K) * shrink[:, None, None])

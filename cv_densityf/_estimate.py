@@ -85,7 +85,7 @@ def run(
     X: NDArray[np.float64],
     robust: Robust,
     *,
-    density: Density = "contrast",
+    density: str = "contrast",
     alpha: float = 0.011,
     dc_percent: float = 2.0,
     scores: NDArray[np.float64] | None = None,
@@ -94,7 +94,7 @@ def run(
     """Estimate F from trusted arguments: X (n, 4) float64, whose rows may hold NaN or Inf."""
     watch = Stopwatch()
     n = len(X)
-    finite = np.isfinite(X).all(axis=1)
+    finite: NDArray[np.bool_] = np.isfinite(X).all(axis=1)
     rows = np.flatnonzero(finite)
     if density == "off" or robust.flag in _DIRECT or len(rows) < MIN_FILTERED:
         why = "density is off" if density == "off" else f"{method_name(robust)} takes no filter"
@@ -104,6 +104,8 @@ def run(
     if len(rows) > MAX_SEARCHED:
         rows = np.sort(np.random.default_rng(seed).choice(rows, MAX_SEARCHED, replace=False))
     Z = X[rows] if len(rows) < n else X
+    if _on_a_line(Z[:, :2]) or _on_a_line(Z[:, 2:]):
+        return _plain(X, finite, robust, watch, "cv2's own call, since all points are on a line")
     if density == "paper":
         r, support = paper_support(Z, alpha, dc_percent)
     else:
@@ -145,6 +147,14 @@ def run(
         timings=watch.laps,
         votes=found.votes,
     )
+
+
+def _on_a_line(points: NDArray[np.float64]) -> bool:
+    """Whether the points lie on one line, or on one spot, as far as float32 can tell."""
+    centred = points - points.mean(axis=0)
+    (a, b), (_, d) = centred.T @ centred / len(points)
+    smallest = 0.5 * (a + d - np.hypot(a - d, 2.0 * b))
+    return bool(smallest <= 1e-12 * np.square(points).max())
 
 
 def _plain(

@@ -75,7 +75,7 @@ def contrast_reliability(X: Floats) -> NDArray[np.float64]:
     return ranks(density_contrast(X))
 
 
-def contrast_support(X: Floats, scores: Floats | None = None) -> tuple[Floats, Bools]:
+def contrast_support(X: Floats, scores: Floats | None = None) -> tuple[NDArray[np.float64], Bools]:
     """Reliability of each match, and the denser half.
 
     With ``scores`` (n,), higher for more trusted matches, the reliability is the rank of the sum of
