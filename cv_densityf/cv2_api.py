@@ -11,6 +11,7 @@ from cv2.typing import MatLike
 from numpy.typing import ArrayLike, NDArray
 
 from cv_densityf._engine import Robust, is_usac, original
+from cv_densityf._epipolar import inlier_mask
 from cv_densityf._estimate import MIN_FILTERED, Density, Estimate, run
 from cv_densityf._overloads import Call, resolve
 from cv_densityf._points import as_array, as_matches, as_umat, n_points
@@ -26,6 +27,9 @@ _GRAPH_CUT_MAX = 40_000
 
 #: Below this threshold cv2's MAGSAC raises whatever the points are.
 _MAGSAC_MIN_THRESHOLD = 1e-3
+
+#: cv2 calls a smaller F[2, 2] zero, and leaves the scale alone.
+_FLOAT32_EPSILON = float(np.finfo(np.float32).eps)
 
 #: No image is this wide: every match is an inlier, and there is nothing to estimate.
 _MAX_THRESHOLD = 1e6
@@ -171,8 +175,9 @@ def findFundamentalMat(
     Returns
     -------
     F : (3, 3) ndarray of float64, or None
-        ``[x', y', 1] @ F @ [x, y, 1] == 0``; None when no model was found. Exactly 7 points and a
-        classic method give up to three matrices below each other, (9, 3).
+        ``[x', y', 1] @ F @ [x, y, 1] == 0``; None when no model was found. As in cv2, the classic
+        methods scale it to ``F[2, 2] == 1`` and USAC to nothing in particular, and exactly 7 points
+        give a classic method up to three matrices below each other, (9, 3).
     mask : (N, 1) ndarray of uint8, cv2.UMat if the points were, or None
         1 for inliers: the method's own rule applied to ``F`` and all N matches. None together with
         ``F`` for fewer than 7 points and where ``params`` finds no model.
@@ -249,16 +254,18 @@ def find(
                 raise
         if not ordinary:
             return _no_model(call, n, usac, slot), None
+    X = as_matches(points1, points2, n, usac)
+    robust = Robust(
+        call.method,
+        # cv2's LMEDS makes its own threshold: no caller's number may change the result.
+        3.0 if call.method == cv2.FM_LMEDS else call.threshold,
+        call.confidence,
+        call.max_iters,
+        call.params,
+    )
     estimate = run(
-        as_matches(points1, points2, n, usac),
-        Robust(
-            call.method,
-            # cv2's LMEDS makes its own threshold: no caller's number may change the result.
-            3.0 if call.method == cv2.FM_LMEDS else call.threshold,
-            call.confidence,
-            call.max_iters,
-            call.params,
-        ),
+        X,
+        robust,
         density=density,
         alpha=alpha,
         dc_percent=dc_percent,
@@ -267,8 +274,12 @@ def find(
     )
     if estimate.F is None:
         return _no_model(call, n, usac, slot), estimate
-    F = np.array(estimate.F, dtype=np.float64, order="C")
-    return (F, slot.deliver(estimate.mask)), estimate
+    F, mask = np.array(estimate.F, dtype=np.float64, order="C"), estimate.mask
+    if not usac and abs(F[2, 2]) > _FLOAT32_EPSILON * np.abs(F).max():
+        # The classic methods' scale, and the mask of exactly these numbers.
+        F /= F[2, 2]
+        mask = inlier_mask(F, X, robust.rule, robust.threshold)
+    return (F, slot.deliver(mask)), estimate
 
 
 class _MaskSlot(NamedTuple):

@@ -335,6 +335,16 @@ def test_shapes_types_and_the_methods_own_mask(method, density):
     assert mask.sum() > 60
 
 
+@pytest.mark.parametrize("method", [cv2.FM_RANSAC, cv2.FM_LMEDS])
+def test_classic_methods_scale_the_last_element_to_one(method):
+    for function in (original, findFundamentalMat):
+        assert function(P1, P2, method)[0][2, 2] == pytest.approx(1.0, abs=1e-12)
+    # Unless it is zero: vertical shifts only, F = [t]x with t = (0, 1, 0)
+    shifted = P1[:40] + np.random.default_rng(0).integers(1, 60, 40)[:, None] * [0, 1]
+    F, _ = findFundamentalMat(P1[:40], shifted, method)
+    assert F is None or (np.isfinite(F).all() and np.abs(F).max() < 1e6)
+
+
 def test_points_count_as_float32():
     """cv2 rounds first, so the mask belongs to the rounded points."""
     exact = findFundamentalMat(P1.astype(np.float64), P2.astype(np.float64), cv2.USAC_MAGSAC, 1.0)
