@@ -95,6 +95,26 @@ def tests(session: nox.Session, opencv: str, numpy: str) -> None:
 
 
 @nox.session
+def clients(session: nox.Session) -> None:
+    """Run machinevision-toolbox-python, which brings OpenCV wheels of its own, on both functions."""
+    session.install(
+        "machinevision-toolbox-python>=2.4",
+        "scikit-learn>=1.6",
+        "pytest>=8.3",
+        "pytest-timeout>=2.3",
+        "hypothesis>=6.100",
+    )
+    session.install("--no-deps", ".")
+    for name in ("cv2:findFundamentalMat", "cv_densityf:findFundamentalMat"):
+        session.run(
+            # Its warnings are not ours.
+            *("python", "-m", "pytest", "-q", "-W", "default", "compat/test_machinevision.py"),
+            *("compat/test_clients.py", *session.posargs),
+            env={"COMPAT_IMPLEMENTATION": name},
+        )
+
+
+@nox.session
 def compat_table(session: nox.Session) -> None:
     """Write the outcomes of the compat sessions into docs/compat.md."""
     found = sorted(str(path) for path in OUTCOMES.glob("*.json"))
