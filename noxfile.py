@@ -96,7 +96,7 @@ def tests(session: nox.Session, opencv: str, numpy: str) -> None:
 
 @nox.session
 def clients(session: nox.Session) -> None:
-    """Run machinevision-toolbox-python, which brings OpenCV wheels of its own, on both functions."""
+    """Run machinevision-toolbox-python, which brings its own OpenCV wheels, on both functions."""
     session.install(
         "machinevision-toolbox-python>=2.4",
         "scikit-learn>=1.6",

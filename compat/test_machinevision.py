@@ -1,4 +1,4 @@
-"""A program as it is: ``CentralCamera.points2F`` of machinevision-toolbox-python, on both functions.
+"""A program as it is: points2F of machinevision-toolbox-python, on both functions.
 
 Runs where that package is installed: ``nox -s clients``.
 """
