@@ -14,11 +14,15 @@ from cv_densityf._stopwatch import Stopwatch
 Floats = NDArray[np.floating]
 Ints = NDArray[np.intp]
 
+#: Draws from the matches within a few thresholds of the best hypothesis so far, dense or not.
+NEAR = 0.0
 #: Shares of the matches, most reliable first, that hypotheses are drawn from, round by round.
-ROUNDS = ((0.25, 0.5), (1.0, 0.75), (0.125, 0.25), (0.5, 1.0), (0.75, 0.125))
-#: Rows a draw gets at least: below that cv2 has too little to choose from.
-MIN_DRAW = 15
-#: cv2's iterations in one draw. More find no better F; several short draws do.
+ROUNDS = ((0.25, 0.5), (1.0, NEAR), (0.125, NEAR), (0.5, NEAR), (0.25, 1.0))
+_NEAR_WIDTH = 8.0
+#: Matches a draw gets at least: fewer crowd on too little of the image to fix F.
+MIN_DRAW = 40
+#: cv2's iterations in one draw from a quarter of the matches, and less from larger, less pure
+#: parts. More find no better F; several short draws do.
 MAX_DRAW_ITERS = 1000
 #: Two hypotheses agree when their inlier sets have this intersection over union.
 _AGREEMENT = 0.97
@@ -28,7 +32,7 @@ _VOTE_WIDTHS = np.array([0.3, 0.5, 0.8, 1.3])
 _GRID = 16
 #: Width of the weights in the polish, in units of the working threshold.
 _POLISH_WIDTH = 0.7
-_POLISH_STEPS = 4
+_POLISH_STEPS = 3
 #: The winner's last steps take weights of this many robust standard deviations: nearly all of what
 #: least squares gets out of normal noise, and little of what heavier tails put in.
 _REFINE_SIGMAS = 3.0
@@ -64,8 +68,9 @@ def search(
 ) -> Consensus | None:
     """Search for the fundamental matrix that the reliable and well spread matches vote for.
 
-    Rounds of two draws on nested sets of the most reliable matches, and on all of them. Each
-    hypothesis is polished on all matches. The search ends when a second, independent draw arrives
+    Rounds of two draws on nested sets of the most reliable matches, on all of them, and on what
+    the best hypothesis so far leaves near its epipolar lines: a nearly right F has the right one's
+    inliers there. Each hypothesis is polished on all matches. The search ends when a second, independent draw arrives
     at the winner's inliers, or after `ROUNDS`.
 
     Parameters
@@ -99,8 +104,15 @@ def search(
     for number, fractions in enumerate(ROUNDS):
         found = []
         for fraction in fractions:
-            part = points[: max(MIN_DRAW, int(n * fraction))]
-            F = draw(part, working, confidence, min(max_iters, MAX_DRAW_ITERS), seed + number)
+            if fraction == NEAR:
+                if len(G) == 0:
+                    continue
+                part = points[squared[best, order] < (_NEAR_WIDTH * working) ** 2]
+            else:
+                part = points[: max(MIN_DRAW, int(n * fraction))]
+            share = max(len(part) / n, 0.25)
+            iters = min(max_iters, int(MAX_DRAW_ITERS * np.sqrt(0.25 / share)))
+            F = draw(part, working, confidence, iters, seed + n_draws)
             n_draws += 1
             if F is not None:
                 found.append(F)
@@ -234,23 +246,26 @@ def eight_point_ransac(
     if n < 8:
         return None
     rng = np.random.default_rng(seed)
-    best, most, drawn, needed = None, 7, 0, max_iters
+    best, most, drawn = None, 7, 0
+    needed: float = max_iters
     while drawn < needed:
-        size = min(_BATCH, needed - drawn)
+        size = min(_BATCH, max_iters - drawn)
         samples = rng.permuted(np.broadcast_to(np.arange(n), (size, n)), axis=1)[:, :8]
         for F in eight_point(X[samples]):
             drawn += 1
             inliers = int(np.count_nonzero(point_line_squared(F, X) <= threshold * threshold))
             if inliers > most:
                 best, most = F, inliers
-                clean = (inliers / n) ** 8
-                if clean >= 1.0:
-                    needed = drawn
-                else:
-                    needed = min(max_iters, np.ceil(np.log1p(-confidence) / np.log1p(-clean)))
+                needed = min(max_iters, _samples_needed(inliers / n, confidence))
             if drawn >= needed:
                 break
     if best is None:
         return None
     reason = f"{most} of the {n} matches that passed the paper's rule agree"
     return Consensus(F=best, votes=(float(most),), n_draws=drawn, reason=reason)
+
+
+def _samples_needed(inlier_ratio: float, confidence: float) -> float:
+    """Samples of eight until one is clean with the given confidence; at least one."""
+    clean = min(inlier_ratio**8, 1.0 - 1e-12)
+    return max(1.0, np.log1p(-confidence) / np.log1p(-clean))

@@ -29,7 +29,7 @@ def _sampson_squared(F: Floats, X: Floats) -> Floats:
     e = F[0, 1] * u + F[1, 1] * v + F[2, 1]
     # The order of cv2's sum: the last bit decides ties at the threshold.
     algebraic = u * a + v * b + F[2, 0] * x + F[2, 1] * y + F[2, 2]
-    return algebraic * algebraic / (a * a + b * b + d * d + e * e)
+    return np.asarray(algebraic * algebraic / (a * a + b * b + d * d + e * e))
 
 
 def point_line_squared(F: Floats, X: Floats) -> Floats:
@@ -44,10 +44,9 @@ def point_line_squared(F: Floats, X: Floats) -> Floats:
     f = F[0, 2] * u + F[1, 2] * v + F[2, 2]
     in_first = x * d + y * e + f
     # cv2 multiplies by the reciprocal.
-    return np.maximum(
-        in_first * in_first * (1.0 / (d * d + e * e)),
-        in_second * in_second * (1.0 / (a * a + b * b)),
-    )
+    squared1 = in_first * in_first * (1.0 / (d * d + e * e))
+    squared2 = in_second * in_second * (1.0 / (a * a + b * b))
+    return np.asarray(np.maximum(squared1, squared2))
 
 
 def sampson_distance(F: Floats, X: Floats) -> Floats:

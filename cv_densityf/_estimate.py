@@ -94,7 +94,7 @@ def run(
     """Estimate F from trusted arguments: X (n, 4) float64, whose rows may hold NaN or Inf."""
     watch = Stopwatch()
     n = len(X)
-    finite: NDArray[np.bool_] = np.isfinite(X).all(axis=1)
+    finite = np.asarray(np.isfinite(X).all(axis=1))
     rows = np.flatnonzero(finite)
     if density == "off" or robust.flag in _DIRECT or len(rows) < MIN_FILTERED:
         why = "density is off" if density == "off" else f"{method_name(robust)} takes no filter"
