@@ -13,6 +13,7 @@ from cv_densityf._stopwatch import Stopwatch
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.intp]
+Bools = NDArray[np.bool_]
 
 #: Draws from the matches within a few thresholds of the best hypothesis so far, dense or not.
 NEAR = 0.0
@@ -70,8 +71,8 @@ def search(
 
     Rounds of two draws on nested sets of the most reliable matches, on all of them, and on what
     the best hypothesis so far leaves near its epipolar lines: a nearly right F has the right one's
-    inliers there. Each hypothesis is polished on all matches. The search ends when a second, independent draw arrives
-    at the winner's inliers, or after `ROUNDS`.
+    inliers there. Each hypothesis is polished on all matches. The search ends when a second,
+    independent draw arrives at the winner's inliers, or after `ROUNDS`.
 
     Parameters
     ----------
@@ -94,66 +95,104 @@ def search(
     n = len(X)
     order = np.argsort(-reliability, kind="stable")
     points = X[order].astype(np.float32)
-    frame = Frame(X)
-    ballot = _Ballot(X, reliability)
     reliable = order[: max(MIN_DRAW, n // 2)]
-    working = threshold
-    G: Floats = np.empty((0, 3, 3))
+    pool = _Pool(X, reliability, threshold)
     n_draws = 0
-    agreed = False
-    for number, fractions in enumerate(ROUNDS):
+    for fractions in ROUNDS:
         found = []
         for fraction in fractions:
-            if fraction == NEAR:
-                if len(G) == 0:
-                    continue
-                part = points[squared[best, order] < (_NEAR_WIDTH * working) ** 2]
-            else:
+            if fraction != NEAR:
                 part = points[: max(MIN_DRAW, int(n * fraction))]
+            elif len(pool):
+                part = points[pool.near_best(_NEAR_WIDTH)[order]]
+            else:
+                continue
             share = max(len(part) / n, 0.25)
             iters = min(max_iters, int(MAX_DRAW_ITERS * np.sqrt(0.25 / share)))
-            F = draw(part, working, confidence, iters, seed + n_draws)
+            F = draw(part, pool.working, confidence, iters, seed + n_draws)
             n_draws += 1
             if F is not None:
                 found.append(F)
         watch.lap("draws")
         if found:
-            new = polish(
-                frame, frame.enter(np.stack(found)), [_POLISH_WIDTH * working] * _POLISH_STEPS
-            )
-            G = np.concatenate([G, new[np.isfinite(new).all(axis=(1, 2))]])
-            watch.lap("polish")
-        if len(G) == 0:
-            continue
-        squared = frame.sampson(G)
-        votes = ballot.count(squared, working)
-        best = int(votes.argmax())
-        if number == 0:
-            scale = _SIGMAS * _noise(squared[best, reliable], threshold)
-            scale = min(max(scale, _SMALLEST_SCALE * threshold), threshold)
-            if scale < 0.9 * threshold:
-                working = scale
-                G = polish(frame, G, [_POLISH_WIDTH * working] * 3)
-                squared = frame.sampson(G)
-                votes = ballot.count(squared, working)
-                best = int(votes.argmax())
-        inliers = (squared < working * working).astype(np.float32)
-        common = inliers @ inliers[best]
-        union = inliers.sum(axis=1) + common[best] - common
-        watch.lap("vote")
-        agreed = int(np.count_nonzero(common >= _AGREEMENT * union)) > 1
-        if agreed:
+            first = len(pool) == 0
+            pool.add(np.stack(found))
+            if first:
+                pool.adapt(reliable)
+        watch.lap("polish")
+        if pool.agrees():
             break
-    if len(G) == 0:
+    if len(pool) == 0:
         return None
-    winner = _refine(frame, G[best : best + 1], squared[best], reliable, threshold)
+    F = pool.refined_best(reliable)
     watch.lap("polish")
-    return Consensus(
-        F=np.ascontiguousarray(frame.leave(winner)[0]),
-        votes=tuple(votes.tolist()),
-        n_draws=n_draws,
-        reason=(f"two of {n_draws} draws agree" if agreed else f"best vote among {n_draws} draws"),
-    )
+    outcome = f"two of {n_draws} draws agree" if pool.agrees() else f"best vote of {n_draws} draws"
+    return Consensus(F=F, votes=tuple(pool.votes.tolist()), n_draws=n_draws, reason=outcome)
+
+
+class _Pool:
+    """Polished hypotheses, their residuals and votes.
+
+    ``working`` is the threshold of draws and votes, pixels: the caller's, or a part of it where the
+    noise is smaller. The caller's threshold rules the mask; the width of the noise is the data's.
+    """
+
+    def __init__(self, X: Floats, reliability: Floats, threshold: float) -> None:
+        self.threshold = threshold
+        self.working = threshold
+        self.votes: Floats = np.empty(0)
+        self._frame = Frame(X)
+        self._ballot = _Ballot(X, reliability)
+        self._G: Floats = np.empty((0, 3, 3))
+        self._squared: Floats = np.empty((0, len(X)))
+
+    def __len__(self) -> int:
+        return len(self._G)
+
+    @property
+    def best(self) -> int:
+        """Index of the hypothesis with the most votes."""
+        return int(self.votes.argmax())
+
+    def add(self, F: Floats) -> None:
+        """Polish hypotheses (m, 3, 3), in pixels, and count the votes for them."""
+        widths = [_POLISH_WIDTH * self.working] * _POLISH_STEPS
+        G = polish(self._frame, self._frame.enter(F), widths)
+        squared = self._frame.sampson(G)
+        self._G = np.concatenate([self._G, G])
+        self._squared = np.concatenate([self._squared, squared])
+        self.votes = np.concatenate([self.votes, self._ballot.count(squared, self.working)])
+
+    def adapt(self, reliable: Ints) -> None:
+        """Narrow the working threshold to the noise of the best hypothesis so far."""
+        scale = _SIGMAS * _noise(self._squared[self.best, reliable], self.threshold)
+        self.working = min(max(scale, _SMALLEST_SCALE * self.threshold), self.threshold)
+        if self.working < self.threshold:
+            G, self._G = self._G, self._G[:0]
+            self._squared, self.votes = self._squared[:0], self.votes[:0]
+            self.add(self._frame.leave(G))
+
+    def near_best(self, width: float) -> Bools:
+        """Mark the matches within ``width`` working thresholds of the best hypothesis."""
+        return np.asarray(self._squared[self.best] < (width * self.working) ** 2)
+
+    def agrees(self) -> bool:
+        """Whether another hypothesis has the best one's inliers."""
+        if len(self) < 2:
+            return False
+        inliers = (self._squared < self.working**2).astype(np.float32)
+        common = inliers @ inliers[self.best]
+        union = inliers.sum(axis=1) + common[self.best] - common
+        return int(np.count_nonzero(common >= _AGREEMENT * union)) > 1
+
+    def refined_best(self, reliable: Ints) -> NDArray[np.float64]:
+        """Polish the best hypothesis at the width of its own residuals; in pixels, (3, 3)."""
+        G, squared = self._G[self.best : self.best + 1], self._squared[self.best]
+        for _ in range(_REFINE_STEPS):
+            width = _REFINE_SIGMAS * _noise(squared[reliable], self.threshold)
+            G = polish(self._frame, G, [max(width, _NARROWEST * self.threshold)])
+            squared = self._frame.sampson(G)[0]
+        return np.ascontiguousarray(self._frame.leave(G)[0])
 
 
 def _noise(squared: Floats, threshold: float) -> float:
@@ -167,15 +206,6 @@ def _noise(squared: Floats, threshold: float) -> float:
         sigma = 1.4826 * float(np.median(below))
         cut = min(threshold, 2.5 * sigma)
     return sigma
-
-
-def _refine(frame: Frame, G: Floats, squared: Floats, reliable: Ints, threshold: float) -> Floats:
-    """Polish the winner at the width of its own residuals on the reliable matches."""
-    for _ in range(_REFINE_STEPS):
-        width = _REFINE_SIGMAS * _noise(squared[reliable], threshold)
-        G = polish(frame, G, [max(width, _NARROWEST * threshold)])
-        squared = frame.sampson(G)[0]
-    return G
 
 
 class _Ballot:
@@ -266,6 +296,6 @@ def eight_point_ransac(
 
 
 def _samples_needed(inlier_ratio: float, confidence: float) -> float:
-    """Samples of eight until one is clean with the given confidence; at least one."""
+    """Count the samples of eight until one is clean with the given confidence; at least one."""
     clean = min(inlier_ratio**8, 1.0 - 1e-12)
-    return max(1.0, np.log1p(-confidence) / np.log1p(-clean))
+    return max(1.0, float(np.log1p(-confidence) / np.log1p(-clean)))
