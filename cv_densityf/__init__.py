@@ -17,6 +17,7 @@ if TYPE_CHECKING:
         FundamentalMatrixEstimator,
     )
     from cv_densityf.matching import Matches, match_images, read_image
+    from cv_densityf.patching import is_patched, patch_cv2, patched, unpatch_cv2
 
 __version__ = "0.1.0"
 
@@ -27,8 +28,12 @@ _LAZY = {
     "DensityPeaksFilter": "estimators",
     "FundamentalMatrixEstimator": "estimators",
     "Matches": "matching",
+    "is_patched": "patching",
     "match_images": "matching",
+    "patch_cv2": "patching",
+    "patched": "patching",
     "read_image": "matching",
+    "unpatch_cv2": "patching",
 }
 
 __all__ = [
@@ -42,8 +47,12 @@ __all__ = [
     "density_peaks",
     "estimate_fundamental",
     "findFundamentalMat",
+    "is_patched",
     "match_images",
+    "patch_cv2",
+    "patched",
     "read_image",
+    "unpatch_cv2",
 ]
 
 

@@ -275,7 +275,7 @@ def eight_point_ransac(
     n = len(X)
     if n < 8:
         return None
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(abs(seed))
     best, most, drawn = None, 7, 0
     needed: float = max_iters
     while drawn < needed:

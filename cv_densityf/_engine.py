@@ -126,7 +126,7 @@ def draw(
     params.threshold = threshold
     params.confidence = confidence
     params.maxIterations = max_iters
-    params.randomGeneratorState = seed
+    params.randomGeneratorState = (seed + 2**31) % 2**32 - 2**31  # a signed 32-bit field
     params.sampler = cv2.SAMPLING_UNIFORM
     params.score = cv2.SCORE_METHOD_MSAC
     params.loMethod = cv2.LOCAL_OPTIM_INNER_LO

@@ -102,7 +102,7 @@ def run(
             why = f"fewer than {MIN_FILTERED} finite matches"
         return _plain(X, finite, robust, watch, f"cv2's own call, since {why}")
     if len(rows) > MAX_SEARCHED:
-        rows = np.sort(np.random.default_rng(seed).choice(rows, MAX_SEARCHED, replace=False))
+        rows = np.sort(np.random.default_rng(abs(seed)).choice(rows, MAX_SEARCHED, replace=False))
     Z = X[rows] if len(rows) < n else X
     if _on_a_line(Z[:, :2]) or _on_a_line(Z[:, 2:]):
         return _plain(X, finite, robust, watch, "cv2's own call, since all points are on a line")
