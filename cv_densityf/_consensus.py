@@ -166,8 +166,8 @@ class _Pool:
     def adapt(self, reliable: Ints) -> None:
         """Narrow the working threshold to the noise of the best hypothesis so far."""
         scale = _SIGMAS * _noise(self._squared[self.best, reliable], self.threshold)
-        self.working = min(max(scale, _SMALLEST_SCALE * self.threshold), self.threshold)
-        if self.working < self.threshold:
+        if scale < self.threshold:
+            self.working = max(scale, _SMALLEST_SCALE * self.threshold)
             G, self._G = self._G, self._G[:0]
             self._squared, self.votes = self._squared[:0], self.votes[:0]
             self.add(self._frame.leave(G))
@@ -196,14 +196,18 @@ class _Pool:
 
 
 def _noise(squared: Floats, threshold: float) -> float:
-    """Robust standard deviation of the residuals that lie below the threshold, pixels."""
-    r = np.sqrt(squared)
+    """Robust standard deviation of the residuals that lie below the threshold, pixels.
+
+    1.4826 times their median, which is taken again over the residuals below 2.5 of these standard
+    deviations until it settles.
+    """
+    r = np.sqrt(np.sort(squared))
     cut, sigma = threshold, 0.4 * threshold
     for _ in range(4):
-        below = r[r < cut]
-        if len(below) < 8:
+        below = int(r.searchsorted(cut))
+        if below < 8:
             break
-        sigma = 1.4826 * float(np.median(below))
+        sigma = 1.4826 * float(r[below // 2])
         cut = min(threshold, 2.5 * sigma)
     return sigma
 

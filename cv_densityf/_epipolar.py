@@ -125,7 +125,7 @@ class Frame:
     def enter(self, F: Floats) -> Floats:
         """Fundamental matrices (m, 3, 3) in pixels, in this frame and of unit norm."""
         G = np.linalg.inv(self._second).T @ F @ np.linalg.inv(self._first)
-        return np.asarray(G / np.linalg.norm(G, axis=(1, 2), keepdims=True))
+        return np.asarray(G / np.sqrt(np.einsum("mij,mij->m", G, G))[:, None, None])
 
     def leave(self, G: Floats) -> Floats:
         """Fundamental matrices (m, 3, 3) of this frame, in pixels."""
