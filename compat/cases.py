@@ -638,7 +638,7 @@ def sizes() -> Iterator[Case]:
                 f"sizes/{n}/{name}",
                 with_method(X, method, 2.0, 0.9, 30),
                 unstable=method == PARALLEL
-                or (versions.GRAPH_CUT_DIES and method == cv2.USAC_ACCURATE and n > 40_000),
+                or (versions.GRAPH_CUT_DIES and method == cv2.USAC_ACCURATE and n > 46_340),
                 X=X,
                 rule=rule_of(method, n),
                 threshold=2.0,

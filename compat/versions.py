@@ -16,7 +16,7 @@ READS_UINT32_AND_BOOL = OPENCV >= (5, 0)
 REFUSES_READ_ONLY_MASK = OPENCV >= (4, 9)
 #: A bool array as ``mask`` is an error; since, it is ignored.
 REFUSES_BOOL_MASK = OPENCV < (5, 0)
-#: Graph cut runs out of memory or kills the process from some 49,000 points on.
+#: Graph cut runs out of memory or kills the process above 46,340 points.
 GRAPH_CUT_DIES = OPENCV >= (5, 0)
 #: The stub that comes with cv2 lists the overloads.
 STUB_HAS_OVERLOADS = OPENCV >= (4, 8)

@@ -39,6 +39,8 @@ _POLISH_STEPS = 3
 _REFINE_SIGMAS = 3.0
 _REFINE_STEPS = 3
 _NARROWEST = 0.1
+#: Noise may exceed the caller's threshold; residuals beyond this many of it are wrong matches.
+_WIDEST = 3.0
 #: A working threshold of this many robust standard deviations of the residuals lets nearly every
 #: inlier vote; it never exceeds the caller's threshold and never falls below a part of it.
 _SIGMAS = 4.0
@@ -196,10 +198,10 @@ class _Pool:
 
 
 def _noise(squared: Floats, threshold: float) -> float:
-    """Robust standard deviation of the residuals that lie below the threshold, pixels.
+    """Robust standard deviation of the inliers' residuals, pixels.
 
-    1.4826 times their median, which is taken again over the residuals below 2.5 of these standard
-    deviations until it settles.
+    1.4826 times the median of the residuals below the threshold, then of those below 2.5 of these
+    standard deviations, until it settles.
     """
     r = np.sqrt(np.sort(squared))
     cut, sigma = threshold, 0.4 * threshold
@@ -208,7 +210,7 @@ def _noise(squared: Floats, threshold: float) -> float:
         if below < 8:
             break
         sigma = 1.4826 * float(r[below // 2])
-        cut = min(threshold, 2.5 * sigma)
+        cut = min(_WIDEST * threshold, 2.5 * sigma)
     return sigma
 
 

@@ -22,8 +22,9 @@ _OPENCV_5 = int(cv2.__version__.split(".")[0]) >= 5
 #: unknown number is LMEDS to cv2.
 _ROBUST = frozenset((cv2.FM_LMEDS, cv2.FM_RANSAC, *range(cv2.USAC_DEFAULT, cv2.USAC_MAGSAC + 1)))
 
-#: OpenCV 5.0 runs out of memory or kills the process when graph cut gets 49,000 points.
-_GRAPH_CUT_MAX = 40_000
+#: Graph cut on more points runs out of memory or kills the process in OpenCV 5.0: it seems to square
+#: their number in 32 bits.
+_GRAPH_CUT_MAX = 46_340
 
 #: Below this threshold cv2's MAGSAC raises whatever the points are.
 _MAGSAC_MIN_THRESHOLD = 1e-3
@@ -198,7 +199,7 @@ def findFundamentalMat(
     Deliberate differences from cv2: where ``FM_RANSAC`` and ``FM_LMEDS`` find no model cv2 returns
     uninitialised memory as the mask and leaves a given ``mask`` as it was; here both are zeros.
     Where cv2's solver raises on valid points, or would take the process down (graph cut on more
-    than 40,000 points in OpenCV 5.0), this function goes on with another engine and answers
+    than 46,340 points in OpenCV 5.0), this function goes on with another engine and answers
     ``None`` only when that finds no model either.
 
     References
