@@ -60,7 +60,7 @@ def epipolar_distance(
     Examples
     --------
     >>> import numpy as np
-    >>> from cv_densityf.epipolar_distance import epipolar_distance
+    >>> from cv_densityf._zhang import epipolar_distance
     >>> rows_match = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]])
     >>> two_rows_lower = np.array([[0, 0, 0], [0, 0, -1], [0, 1, -2]])
     >>> round(epipolar_distance(rows_match, two_rows_lower, (640, 480), (640, 480)), 6)
@@ -94,14 +94,14 @@ def _one_way(
         one = np.ones((n, 1))
         m1 = np.hstack([draws[:, :2] * size1, one])
         on_line, meets = _along(m1 @ F.T, size2, draws[:, 2])
-        m2 = np.hstack([on_line, one])
+        m1, m2 = m1[meets], np.hstack([on_line, one])[meets]
         lines2, lines1 = m1 @ G.T, m2 @ G
         algebraic = np.abs((m2 * lines2).sum(axis=1))
         with np.errstate(divide="ignore", invalid="ignore"):
             distance = algebraic / np.hypot(lines1[:, 0], lines1[:, 1])
             distance += algebraic / np.hypot(lines2[:, 0], lines2[:, 1])
         # NaN where a point is the epipole itself, which has no line.
-        distance = distance[meets & ~np.isnan(distance)][: n - found]
+        distance = distance[~np.isnan(distance)][: n - found]
         total, found = total + float(distance.sum()) / 2, found + len(distance)
         if found == n:
             break
