@@ -1,0 +1,338 @@
+"""Residuals against cv2 and the textbook, least-squares fits against cv2, scipy and known F."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from cv_densityf._engine import original
+from cv_densityf._epipolar import (
+    _SQUARE,
+    Frame,
+    _rotation,
+    eight_point,
+    inlier_mask,
+    point_line_squared,
+    polish,
+    residuals,
+    sampson_distance,
+)
+from cv_densityf.datasets import two_view_scene
+
+SEEDS = range(5)
+
+
+def unit(F):
+    """The same matrix with norm 1 and its largest entry positive."""
+    F = F / np.linalg.norm(F)
+    return F * np.sign(F.flat[np.abs(F).argmax()])
+
+
+def exact_scene(seed, n=60):
+    return two_view_scene(n, inlier_ratio=1.0, noise=0.0, random_state=seed)
+
+
+def noisy_scene(seed, n=200, inlier_ratio=1.0, noise=0.7):
+    return two_view_scene(n, inlier_ratio=inlier_ratio, noise=noise, random_state=seed)
+
+
+def perturbed(frame, F, seed, size=0.01):
+    """A matrix near F, of rank 3, in the frame."""
+    G = frame.enter(F[None])
+    return G + size * np.random.default_rng(seed).normal(size=(1, 3, 3))
+
+
+def robust_cost(frame, G, scale):
+    """Geman and McClure's, of the Sampson distances in pixels."""
+    squared = frame.sampson(G)[0] / scale**2
+    return (squared / (1 + squared)).sum()
+
+
+def singular_values(frame, F):
+    """Of F where its entries are of like size: rank is no matter of pixels."""
+    return np.linalg.svd(frame.enter(F))[1]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_sampson_distance_is_cv2s(seed):
+    scene = noisy_scene(seed, inlier_ratio=0.5)
+    expected = [
+        np.sqrt(cv2.sampsonDistance(np.append(p, 1.0), np.append(q, 1.0), scene.F))
+        for p, q in zip(scene.points1, scene.points2, strict=True)
+    ]
+    np.testing.assert_allclose(sampson_distance(scene.F, scene.X), expected, rtol=1e-9)
+    np.testing.assert_array_equal(
+        residuals(scene.F, scene.X, "usac"), sampson_distance(scene.F, scene.X)
+    )
+
+
+def test_sampson_distance_is_the_way_to_the_nearest_exact_match():
+    scene = noisy_scene(0, noise=0.5)
+    exact1, exact2 = cv2.correctMatches(scene.F, scene.points1[None], scene.points2[None])
+    way = np.linalg.norm(scene.X - np.hstack([exact1[0], exact2[0]]), axis=1)
+    np.testing.assert_allclose(sampson_distance(scene.F, scene.X), way, rtol=0.02, atol=1e-4)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_point_line_distance_is_the_larger_one_to_cv2s_lines(seed):
+    scene = noisy_scene(seed, inlier_ratio=0.5)
+    points = [p.astype(np.float32).astype(float) for p in (scene.points1, scene.points2)]
+    distances = []
+    for image in (1, 2):
+        lines = cv2.computeCorrespondEpilines(points[image - 1], image, scene.F)[:, 0]
+        other = points[2 - image]
+        distances.append(
+            np.abs(lines[:, 0] * other[:, 0] + lines[:, 1] * other[:, 1] + lines[:, 2])
+        )
+    expected = np.maximum(*distances)
+    for rule in ("ransac", "lmeds"):
+        np.testing.assert_allclose(residuals(scene.F, scene.X, rule), expected, atol=1e-6)
+    np.testing.assert_allclose(point_line_squared(scene.F, scene.X), expected**2, rtol=1e-4)
+
+
+def test_residuals_are_in_pixels_and_know_no_scale_of_f():
+    """Images four times as large have residuals four times as large."""
+    scene = noisy_scene(1)
+    grow = np.diag([0.25, 0.25, 1.0])
+    for rule in ("usac", "ransac", "lmeds"):
+        small = residuals(scene.F, scene.X, rule)
+        large = residuals(grow @ scene.F @ grow, 4 * scene.X, rule)
+        np.testing.assert_allclose(large, 4 * small, rtol=1e-9)
+        np.testing.assert_allclose(residuals(-7 * scene.F, scene.X, rule), small, rtol=1e-9)
+
+
+def test_lmeds_takes_two_and_a_half_robust_deviations():
+    """A threshold from the median residual, which the caller's threshold does not move."""
+    between = 0
+    for seed in range(20):
+        scene = noisy_scene(seed, n=31)
+        distance = residuals(scene.F, scene.X, "lmeds")
+        large_sample = 2.5 * 1.4826 * np.median(distance)
+        cut = (1 + 5 / 24) * large_sample
+        between += np.count_nonzero((distance > large_sample) & (distance <= cut))
+        for threshold in (0.1, 30.0):
+            np.testing.assert_array_equal(
+                inlier_mask(scene.F, scene.X, "lmeds", threshold), distance <= cut
+            )
+    assert between > 0  # or the correction for small samples would not show
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_frame_and_back(seed):
+    scene = noisy_scene(seed)
+    frame = Frame(scene.X)
+    G = frame.enter(np.stack([scene.F, -3 * scene.F.T]))
+    np.testing.assert_allclose(np.linalg.norm(G, axis=(1, 2)), 1)
+    there = frame.leave(G)
+    np.testing.assert_allclose(unit(there[0]), unit(scene.F), atol=1e-12)
+    np.testing.assert_allclose(unit(there[1]), unit(-scene.F.T), atol=1e-12)
+
+
+def test_distances_in_the_frame_are_pixels():
+    scene = noisy_scene(0, inlier_ratio=0.5)
+    X = scene.X + np.array([300.0, -200.0, 1000.0, 5.0])
+    back1 = np.array([[1.0, 0, -300], [0, 1, 200], [0, 0, 1]])
+    back2 = np.array([[1.0, 0, -1000], [0, 1, -5], [0, 0, 1]])
+    F = back2.T @ scene.F @ back1
+    frame = Frame(X)
+    np.testing.assert_allclose(
+        np.sqrt(frame.sampson(frame.enter(np.stack([F, 2 * F])))),
+        np.stack([sampson_distance(F, X)] * 2),
+        rtol=1e-6,
+    )
+
+
+def test_frame_is_centred_with_one_scale_for_both_images():
+    X = np.random.default_rng(0).uniform(0, [100, 50, 4000, 3000], (50, 4))
+    frame = Frame(X)
+    Z = np.vstack([frame.homogeneous1[:2], frame.homogeneous2[:2]])
+    np.testing.assert_allclose(Z.mean(axis=1), 0, atol=1e-12)
+    assert np.sqrt((Z**2).mean()) == pytest.approx(1)
+    np.testing.assert_allclose(Z, (X - X.mean(axis=0)).T * frame.scale, atol=1e-12)
+
+
+def test_frame_sums_the_normal_matrix():
+    """The upper triangles, weighted, summed and unfolded, are A^T W A of the design matrix A."""
+    frame = Frame(noisy_scene(3, n=40).X)
+    weight = np.random.default_rng(0).uniform(size=40)
+    A = np.einsum("in,jn->nij", frame.homogeneous2, frame.homogeneous1).reshape(40, 9)
+    np.testing.assert_allclose((frame.outer @ weight)[_SQUARE], (A.T * weight) @ A, atol=1e-12)
+
+
+def test_frame_of_one_spot_is_finite():
+    frame = Frame(np.full((20, 4), 7.0))
+    assert np.isfinite(frame.scale)
+    assert np.isfinite(frame.leave(frame.enter(np.eye(3)[None]))).all()
+
+
+@pytest.mark.parametrize("k", [8, 9, 30])
+def test_eight_point_is_cv2s(k):
+    sets = np.stack([noisy_scene(seed, n=k, noise=1.0).X for seed in range(20)])
+    sets = sets.astype(np.float32).astype(np.float64)
+    for mine, X in zip(eight_point(sets), sets, strict=True):
+        theirs, _ = original(X[:, :2], X[:, 2:], cv2.FM_8POINT)
+        frame = Frame(X)
+        mine, theirs = unit(frame.enter(mine[None])[0]), unit(frame.enter(theirs[None])[0])
+        np.testing.assert_allclose(mine, theirs, atol=1e-5)
+
+
+@pytest.mark.parametrize("k", [8, 20])
+def test_eight_point_of_exact_matches_is_exact_and_of_rank_two(k):
+    for seed in SEEDS:
+        scene = exact_scene(seed, 60)
+        rng = np.random.default_rng(seed)
+        samples = scene.X[np.stack([rng.choice(60, k, replace=False) for _ in range(4)])]
+        F = eight_point(samples)
+        np.testing.assert_allclose(np.linalg.norm(F, axis=(1, 2)), 1)
+        assert (singular_values(Frame(scene.X), F)[:, 2] < 1e-12).all()
+        # A sample on one plane fixes no F; the median one is not.
+        assert np.median([sampson_distance(f, scene.X).max() for f in F]) < 1e-4
+
+
+def test_eight_point_solves_each_set_on_its_own():
+    sets = np.stack([noisy_scene(seed, n=12).X for seed in SEEDS])
+    alone = np.concatenate([eight_point(one[None]) for one in sets])
+    for together, single in zip(eight_point(sets), alone, strict=True):
+        np.testing.assert_allclose(unit(together), unit(single), atol=1e-12)
+
+
+def test_rotations_are_rotations():
+    axes = np.random.default_rng(0).normal(size=(200, 3))
+    R = _rotation(axes)
+    np.testing.assert_allclose(
+        R @ R.transpose(0, 2, 1), np.broadcast_to(np.eye(3), R.shape), atol=1e-12
+    )
+    np.testing.assert_allclose(np.linalg.det(R), 1)
+
+
+def test_small_rotations_are_the_exponential_to_second_order():
+    axes = np.random.default_rng(0).normal(size=(50, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    for angle in (1e-1, 1e-2, 1e-3):
+        gap = _rotation(angle * axes) - Rotation.from_rotvec(angle * axes).as_matrix()
+        assert np.abs(gap).max() < 0.1 * angle**3
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_polish_finds_the_exact_f_again(seed):
+    scene = exact_scene(seed)
+    frame = Frame(scene.X)
+    start = perturbed(frame, scene.F, seed, 1e-3)
+    G = polish(frame, start, [50.0] * 3 + [5.0] * 20)
+    assert np.sqrt(frame.sampson(start)).max() > 0.1
+    assert np.sqrt(frame.sampson(G)).max() < 1e-6
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_polished_matrices_have_rank_two_and_norm_one(seed):
+    scene = noisy_scene(seed, inlier_ratio=0.5)
+    frame = Frame(scene.X)
+    start = np.concatenate([perturbed(frame, scene.F, s, 0.05) for s in range(8)])
+    assert (np.linalg.svd(start)[1][:, 2] > 1e-4).any()
+    for steps in (1, 4):
+        G = polish(frame, start, [2.0] * steps)
+        np.testing.assert_allclose(np.linalg.norm(G, axis=(1, 2)), 1)
+        assert (np.linalg.svd(G)[1][:, 2] < 1e-14).all()
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_step_of_polish_lowers_the_robust_cost(seed):
+    scene = noisy_scene(seed, n=300, inlier_ratio=0.4)
+    frame = Frame(scene.X)
+    G = polish(frame, perturbed(frame, scene.F, seed, 2e-4), [3.0])
+    costs = [robust_cost(frame, G, 3.0)]
+    for _ in range(8):
+        G = polish(frame, G, [3.0])
+        costs.append(robust_cost(frame, G, 3.0))
+    # Near the minimum the steps are those of the frozen gradient norm: equal, not lower.
+    assert (np.diff(costs) < 1e-4 * costs[0]).all()
+    assert costs[-1] <= costs[0]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_polish_without_outliers_is_scipys_least_squares(seed):
+    """With weights much wider than the noise: the minimum of the squared Sampson distances."""
+    scene = noisy_scene(seed, n=80)
+    frame = Frame(scene.X)
+    start = perturbed(frame, scene.F, seed, 2e-3)
+    U, S, Vt = np.linalg.svd(start[0])
+
+    def matrix(p):
+        left, right = Rotation.from_rotvec([p[:3], p[3:6]]).as_matrix()
+        return U @ left @ np.diag([S[0], S[1] * (1 + p[6]), 0]) @ right @ Vt
+
+    best = least_squares(
+        lambda p: sampson_distance(frame.leave(matrix(p)[None])[0], scene.X),
+        np.zeros(7),
+        xtol=1e-12,
+        ftol=1e-12,
+    )
+    G = polish(frame, start, [1e3] * 15)
+    assert frame.sampson(G).sum() == pytest.approx(2 * best.cost, rel=1e-3)
+    assert frame.sampson(start).sum() > 2.5 * best.cost
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_polish_follows_when_the_images_are_moved_turned_and_scaled(seed):
+    """Sampson distances do not change when an image is moved or turned, and scale with it."""
+    scene = noisy_scene(seed, n=150, inlier_ratio=0.6)
+    rng = np.random.default_rng(seed)
+    scale = 2.5
+    moved, maps = [], []
+    for points in (scene.points1, scene.points2):
+        a, shift = rng.uniform(0, 2 * np.pi), rng.uniform(-900, 900, 2)
+        turn = scale * np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
+        moved.append(points @ turn.T + shift)
+        H = np.eye(3)
+        H[:2, :2], H[:2, 2] = turn, shift
+        maps.append(np.linalg.inv(H))
+    X = np.hstack(moved)
+    here, there = Frame(scene.X), Frame(X)
+    start = polish(here, perturbed(here, scene.F, seed, 1e-3), [20.0])
+    F = here.leave(polish(here, start, [3.0, 2.0, 1.0]))[0]
+    start_there = there.enter(maps[1].T @ here.leave(start) @ maps[0])
+    F_there = there.leave(polish(there, start_there, [scale * s for s in (3.0, 2.0, 1.0)]))[0]
+    np.testing.assert_allclose(
+        sampson_distance(F_there, X), scale * sampson_distance(F, scene.X), rtol=1e-5, atol=1e-7
+    )
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_polish_of_the_swapped_images_is_the_transpose(seed):
+    scene = noisy_scene(seed, inlier_ratio=0.6)
+    here, there = Frame(scene.X), Frame(scene.X[:, [2, 3, 0, 1]])
+    start = perturbed(here, scene.F, seed, 1e-3)
+    scales = [5.0, 3.0, 1.0, 1.0]
+    G = polish(here, start, scales)[0]
+    swapped = polish(there, start.transpose(0, 2, 1), scales)[0]
+    np.testing.assert_allclose(unit(swapped.T), unit(G), atol=1e-9)
+
+
+def test_polish_takes_each_matrix_alone_and_each_its_own_scales():
+    scene = noisy_scene(0, inlier_ratio=0.5)
+    frame = Frame(scene.X)
+    starts = np.concatenate([perturbed(frame, scene.F, s, 1e-3) for s in range(4)])
+    widths = np.array([1.0, 2.0, 4.0, 8.0])
+    together = polish(frame, starts, [widths, widths / 2])
+    for start, G, width in zip(starts, together, widths, strict=True):
+        alone = polish(frame, start[None], [width, width / 2])[0]
+        np.testing.assert_allclose(unit(G), unit(alone), atol=1e-10)
+
+
+def test_wrong_matches_hardly_move_polish():
+    """A third of wrong matches, far from their lines, changes less than the noise does."""
+    for seed in SEEDS:
+        scene = noisy_scene(seed, n=300, inlier_ratio=0.7)
+        true = exact_scene(seed, 300).X
+        right, whole = Frame(scene.X[scene.inliers]), Frame(scene.X)
+        start = whole.leave(perturbed(whole, scene.F, seed, 1e-4))
+        scales = [4.0, 2.0, 2.0, 2.0, 2.0]
+        alone = right.leave(polish(right, right.enter(start), scales))[0]
+        among = whole.leave(polish(whole, whole.enter(start), scales))[0]
+        error = [sampson_distance(F, true).mean() for F in (alone, among)]
+        assert error[1] < error[0] + 0.35
+        flat = whole.leave(polish(whole, whole.enter(start), [1e4] * 5))[0]
+        assert sampson_distance(flat, true).mean() > 3 * error[1]
