@@ -22,7 +22,7 @@ _OPENCV_5 = int(cv2.__version__.split(".")[0]) >= 5
 #: unknown number is LMEDS to cv2.
 _ROBUST = frozenset((cv2.FM_LMEDS, cv2.FM_RANSAC, *range(cv2.USAC_DEFAULT, cv2.USAC_MAGSAC + 1)))
 
-#: With more points graph cut runs out of memory or kills the process in OpenCV 5.0, as if it squared
+#: On more points graph cut runs out of memory or kills the process in OpenCV 5.0, as if it squared
 #: their number in 32 bits.
 _GRAPH_CUT_MAX = 46_340
 
