@@ -20,7 +20,7 @@ Density = Literal["contrast", "paper", "off"]
 #: With fewer matches cv2 turns RANSAC into LMEDS, and there is no density to speak of.
 MIN_FILTERED = 15
 #: More matches than this add nothing to F: the search runs on a seeded subset, the mask on all.
-MAX_SEARCHED = 10_000
+MAX_SEARCHED = 5_000
 #: cv2's direct kernels take every match as true.
 _DIRECT = (1, 2)
 
