@@ -44,6 +44,12 @@ def test_every_name_is_cv2s_constant(name):
     assert method_name(Robust(flag, 1.0, 0.99, 100)) == name
 
 
+def test_each_method_has_its_rule():
+    for name, flag in METHODS.items():
+        expected = "usac" if name.startswith("usac") else "ransac" if name == "ransac" else "lmeds"
+        assert Robust(flag, 1.0, 0.99, 100).rule == expected
+
+
 def test_names_hold_all_of_cv2s_usac_methods():
     flags = {getattr(cv2, name) for name in dir(cv2) if name.startswith("USAC_")}
     assert flags <= set(METHODS.values())

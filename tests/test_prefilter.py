@@ -1,0 +1,237 @@
+"""Reliability of matches: against slow definitions, invariances, and known right matches."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import reference_density
+from scipy.stats import rankdata
+
+from cv_densityf import _prefilter
+from cv_densityf._prefilter import (
+    N_NEIGHBORS,
+    contrast_reliability,
+    contrast_support,
+    density_contrast,
+    paper_support,
+    ranks,
+)
+from cv_densityf.datasets import two_view_scene
+
+SEEDS = range(4)
+
+
+def scene_of(seed, n=400, inlier_ratio=0.3):
+    return two_view_scene(n, inlier_ratio=inlier_ratio, noise=0.5, random_state=seed)
+
+
+def auc(values, positive):
+    """Chance that a right match ranks above a wrong one."""
+    rank = rankdata(values)[positive].sum()
+    n, m = positive.sum(), (~positive).sum()
+    return (rank - n * (n + 1) / 2) / (n * m)
+
+
+def contrast_by_definition(X, k):
+    """Each neighbour in both images counts 1 / its place in the list where it stands later."""
+    n = len(X)
+    contrast = np.zeros(n)
+    for i in range(n):
+        others = [j for j in range(n) if j != i]
+        places = []
+        for Y in (X[:, :2], X[:, 2:]):
+            near = sorted(others, key=lambda j, Y=Y: np.hypot(*(Y[j] - Y[i])))[:k]
+            places.append({j: place for place, j in enumerate(near, start=1)})
+        for j in places[0].keys() & places[1].keys():
+            contrast[i] += 1 / max(places[0][j], places[1][j])
+    return contrast
+
+
+@pytest.mark.parametrize("k", [1, 3, 10, 200])
+@pytest.mark.parametrize("n", [2, 3, 12, 90])
+def test_contrast_is_the_definition(n, k):
+    X = two_view_scene(n, inlier_ratio=0.5, random_state=n).X
+    expected = contrast_by_definition(X, min(k, n - 1))
+    np.testing.assert_allclose(density_contrast(X, k), expected, rtol=1e-12)
+
+
+def test_contrast_looks_at_ten_neighbours_unless_told():
+    X = scene_of(0, 60).X
+    np.testing.assert_array_equal(density_contrast(X), density_contrast(X, N_NEIGHBORS))
+
+
+def test_contrast_does_not_depend_on_how_the_work_is_cut(monkeypatch):
+    X = scene_of(1, 100).X
+    whole = density_contrast(X)
+    monkeypatch.setattr(_prefilter, "_CHUNK", 7)
+    np.testing.assert_array_equal(density_contrast(X), whole)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_neighbours_are_k_nearest_other_points_even_among_duplicates(seed):
+    rng = np.random.default_rng(seed)
+    points = rng.integers(0, 4, (60, 2)).astype(float)
+    points[20:40] = points[0]
+    distances = np.hypot(*(points[:, None] - points[None]).transpose(2, 0, 1))
+    for k in (1, 5, 30, 59):
+        near = _prefilter._neighbors(points, k)
+        assert near.shape == (60, k)
+        for i, row in enumerate(near):
+            assert len(set(row.tolist()) - {i}) == k
+            expected = np.sort(np.delete(distances[i], i))[:k]
+            np.testing.assert_array_equal(distances[i, row], expected)
+
+
+def test_no_contrast_exceeds_that_of_shared_neighbourhoods_even_with_duplicates():
+    X = scene_of(2, 100, inlier_ratio=0.0).X
+    X[:30] = X[0]
+    X[30:35, :2] = X[30, :2]
+    contrast = density_contrast(X, 5)
+    assert contrast.min() >= 0
+    assert contrast.max() <= (1 / np.arange(1, 6)).sum() + 1e-12
+
+
+def test_all_matches_equal_is_no_error():
+    for n in (2, 5, 40):
+        contrast = density_contrast(np.ones((n, 4)))
+        assert contrast.shape == (n,)
+        assert np.isfinite(contrast).all()
+
+
+def test_right_pairs_share_all_their_neighbours_and_random_pairs_few():
+    """Identical images give the harmonic number; chance pairing shares k^2 / n neighbours."""
+    rng = np.random.default_rng(0)
+    Y = rng.uniform(0, 1000, (2000, 2))
+    same = density_contrast(np.hstack([Y, Y]), 10)
+    np.testing.assert_allclose(same, (1 / np.arange(1, 11)).sum())
+    chance = density_contrast(np.hstack([Y, rng.permutation(Y)]), 10)
+    assert chance.mean() < 10 * 10 / 2000
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_contrast_does_not_change_with_the_scale_and_place_of_an_image(seed):
+    X = scene_of(seed).X
+    contrast = density_contrast(X)
+    # Powers of two leave the order of distances as it is to the last bit.
+    np.testing.assert_array_equal(density_contrast(X * [4, 4, 0.5, 0.5]), contrast)
+    np.testing.assert_allclose(density_contrast(3.3 * X + [50, -7, 1000, 1]), contrast, rtol=1e-12)
+    turned = X[:, [1, 0, 2, 3]] * [-1, 1, 1, 1]
+    np.testing.assert_allclose(density_contrast(turned), contrast, rtol=1e-12)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_contrast_does_not_care_which_image_comes_first_nor_for_the_order(seed):
+    X = scene_of(seed).X
+    order = np.random.default_rng(seed).permutation(len(X))
+    contrast = density_contrast(X)
+    np.testing.assert_allclose(density_contrast(X[:, [2, 3, 0, 1]]), contrast, rtol=1e-12)
+    np.testing.assert_allclose(density_contrast(X[order]), contrast[order], rtol=1e-12)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_right_matches_rank_above_wrong_ones(seed):
+    scene = scene_of(seed, 600, inlier_ratio=0.3)
+    reliability, kept = contrast_support(scene.X)
+    assert auc(reliability, scene.inliers) > 0.8
+    top = np.argsort(-reliability)[:90]
+    assert scene.inliers[top].mean() > 0.8
+    assert scene.inliers[kept].mean() > 1.3 * 0.3
+
+
+def test_chance_ranks_nothing():
+    """Where no match is right, what happens to be wrong in a crowd is not preferred."""
+    rng = np.random.default_rng(0)
+    crowd = np.vstack([rng.normal(500, 20, (200, 2)), rng.uniform(0, 1000, (200, 2))])
+    X = np.hstack([crowd, crowd[rng.permutation(400)]])
+    assert abs(auc(density_contrast(X), np.arange(400) < 200) - 0.5) < 0.1
+
+
+def test_ranks_run_from_zero_to_one_in_order_of_values_then_rows():
+    for seed in SEEDS:
+        values = np.random.default_rng(seed).integers(0, 5, 30).astype(float)
+        expected = (rankdata(values, method="ordinal") - 1) / 29
+        np.testing.assert_allclose(ranks(values), expected)
+    assert ranks(np.array([3.0])).tolist() == [0.0]
+
+
+def test_reliability_is_the_rank_of_the_contrast_and_the_better_half_is_kept():
+    X = scene_of(3, 101).X
+    reliability, kept = contrast_support(X)
+    np.testing.assert_array_equal(reliability, ranks(density_contrast(X)))
+    np.testing.assert_array_equal(reliability, contrast_reliability(X))
+    assert kept.dtype == bool
+    assert kept.sum() == 51
+    assert reliability[kept].min() > reliability[~kept].max()
+
+
+def test_a_better_score_raises_the_reliability_of_its_match():
+    scene = scene_of(0, 200)
+    scores = np.random.default_rng(0).uniform(size=200)
+    before = contrast_support(scene.X, scores)[0]
+    for row in (3, 50, 120):
+        raised = scores.copy()
+        raised[row] = 2.0
+        after = contrast_support(scene.X, raised)[0]
+        assert after[row] > before[row]
+        # The others keep their order.
+        rest = np.arange(200) != row
+        moved = np.abs(ranks(after[rest]) - ranks(before[rest]))
+        assert moved.max() < 0.02
+
+
+def test_only_the_order_of_scores_counts():
+    scene = scene_of(0, 200)
+    scores = np.random.default_rng(0).uniform(size=200)
+    for same in (np.exp(9 * scores), scores - 1e6, rankdata(scores)):
+        np.testing.assert_array_equal(
+            contrast_support(scene.X, same)[0], contrast_support(scene.X, scores)[0]
+        )
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_good_scores_help_and_bad_ones_do_not_overrule_the_contrast(seed):
+    scene = scene_of(seed, 600)
+    rng = np.random.default_rng(seed)
+    alone = auc(contrast_support(scene.X)[0], scene.inliers)
+    good = np.where(scene.inliers, rng.beta(4, 2, 600), rng.beta(2, 4, 600))
+    assert auc(contrast_support(scene.X, good)[0], scene.inliers) > alone
+    assert auc(contrast_support(scene.X, rng.uniform(size=600))[0], scene.inliers) > 0.75
+    assert auc(contrast_support(scene.X, -good)[0], scene.inliers) > 0.5
+
+
+@pytest.mark.parametrize("alpha", [0.0, 0.011, 0.3, 1.0])
+@pytest.mark.parametrize("percent", [2.0, 10.0])
+def test_papers_rule_is_the_formula(alpha, percent):
+    X = scene_of(1, 80, inlier_ratio=0.6).X
+    reliability, kept = paper_support(X, alpha, percent)
+    low, high = reference_density.cutoff_interval(X.tolist(), percent)
+    rho = np.array(reference_density.density(X.tolist(), (low + high) / 2, "cutoff"), float)
+    delta, _ = reference_density.delta_and_predecessor(X.tolist(), rho.tolist())
+    gamma = rho * np.array(delta)
+    np.testing.assert_allclose(reliability, gamma / (rho.max() * max(delta)), rtol=1e-9)
+    clear = np.abs(gamma - alpha * rho.max() * max(delta)) > 1e-9
+    np.testing.assert_array_equal(kept[clear], (gamma >= alpha * rho.max() * max(delta))[clear])
+
+
+def test_papers_rule_drops_more_with_larger_alpha_and_nothing_at_zero():
+    X = scene_of(1).X
+    supports = [paper_support(X, alpha, 2.0)[1] for alpha in (0.0, 0.005, 0.011, 0.1, 1.0)]
+    assert supports[0].all()
+    for larger, smaller in pairwise(supports):
+        assert not (smaller & ~larger).any()
+        assert smaller.sum() < larger.sum()
+
+
+def test_papers_rule_keeps_mostly_right_matches():
+    for seed in SEEDS:
+        scene = scene_of(seed, 600, inlier_ratio=0.3)
+        kept = paper_support(scene.X, 0.011, 2.0)[1]
+        assert scene.inliers[kept].mean() > 1.2 * 0.3
+
+
+def test_papers_rule_keeps_all_of_equal_matches():
+    reliability, kept = paper_support(np.ones((30, 4)), 0.011, 2.0)
+    assert kept.all()
+    assert np.isfinite(reliability).all()
