@@ -1,0 +1,389 @@
+"""The search finds known geometry, ends by its rules, and its vote counts as it says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from cv_densityf import _consensus
+from cv_densityf._consensus import (
+    _Ballot,
+    _noise,
+    _samples_needed,
+    eight_point_ransac,
+    search,
+)
+from cv_densityf._epipolar import Frame, point_line_squared, polish, sampson_distance
+from cv_densityf._prefilter import contrast_reliability
+from cv_densityf._stopwatch import Stopwatch
+from cv_densityf.datasets import two_view_scene
+
+SEEDS = range(4)
+ASKED = {"threshold": 1.0, "confidence": 0.999, "max_iters": 5000}
+
+
+def find(X, reliability=None, *, seed=0, **asked):
+    if reliability is None:
+        reliability = contrast_reliability(X)
+    return search(X, reliability, seed=seed, watch=Stopwatch(), **{**ASKED, **asked})
+
+
+def true_matches(seed, n=400):
+    """Exact matches all over a scene with the seed's geometry."""
+    return two_view_scene(n, inlier_ratio=1.0, noise=0.0, random_state=seed).X
+
+
+def scene_of(seed, n=600, inlier_ratio=0.3, noise=0.5):
+    return two_view_scene(n, inlier_ratio=inlier_ratio, noise=noise, random_state=seed)
+
+
+def mostly_one_plane(seed, n=500, inlier_ratio=0.6, share=0.9, noise=0.5):
+    """Matches, and exact ones off the plane that ``share`` of the right ones lie on."""
+    rng = np.random.default_rng(seed)
+    K = np.array([[1000.0, 0, 640], [0, 1000, 480], [0, 0, 1]])
+    angle = rng.uniform(-0.1, 0.1)
+    R = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    t = np.array([1.0, rng.uniform(-0.3, 0.3), rng.uniform(-0.2, 0.2)])
+
+    def project(pixels, depth):
+        rays = np.hstack([pixels, np.ones((len(pixels), 1))]) @ np.linalg.inv(K).T
+        second = (rays * depth[:, None] @ R.T + t) @ K.T
+        return np.hstack([pixels, second[:, :2] / second[:, 2:]])
+
+    size = np.array([1280, 960])
+    n_true = round(n * inlier_ratio)
+    pixels = rng.uniform(0, size, (n_true, 2))
+    depth = 8 + 0.003 * pixels[:, 0]
+    off = np.arange(n_true) >= share * n_true
+    depth[off] = rng.uniform(4, 7, off.sum())
+    X = project(pixels, depth) + rng.normal(0, noise, (n_true, 4))
+    wrong = rng.uniform(0, np.tile(size, 2), (n - n_true, 4))
+    judges = project(rng.uniform(0, size, (300, 2)), rng.uniform(4, 12, 300))
+    return rng.permutation(np.vstack([X, wrong])), judges
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_finds_f_among_thirty_per_cent_right_matches(seed):
+    found = find(scene_of(seed).X)
+    assert found.F.shape == (3, 3)
+    assert sampson_distance(found.F, true_matches(seed)).mean() < 0.5
+    assert abs(np.linalg.det(found.F / np.linalg.norm(found.F))) < 1e-12
+
+
+def least_squares(X, F):
+    """Refine F on all of X alike, from where it is."""
+    frame = Frame(X)
+    return frame.leave(polish(frame, frame.enter(F[None]), [1e4] * 10))[0]
+
+
+def errors_beside_least_squares(threshold, *, inlier_ratio, noise, n):
+    """Mean errors of the search, and of least squares on the right matches alone."""
+    errors = []
+    for seed in range(15):
+        scene = scene_of(seed, n=n, inlier_ratio=inlier_ratio, noise=noise)
+        F = find(scene.X, threshold=threshold).F
+        best = least_squares(scene.X[scene.inliers], F)
+        errors.append([sampson_distance(f, true_matches(seed)).mean() for f in (F, best)])
+    return np.array(errors).T
+
+
+def test_is_as_good_as_least_squares_where_all_matches_are_right():
+    """Noise near the threshold included: the right matches beyond it still say where F is."""
+    search, best = errors_beside_least_squares(1.0, inlier_ratio=1.0, noise=0.8, n=300)
+    assert search.mean() < 1.15 * best.mean()
+
+
+def test_wrong_matches_cost_little():
+    search, best = errors_beside_least_squares(1.0, inlier_ratio=0.5, noise=0.5, n=600)
+    assert np.median(search) < 1.6 * np.median(best)
+
+
+def test_a_generous_threshold_costs_little():
+    """The threshold is for the mask; how far matches scatter shows in the matches."""
+    search, best = errors_beside_least_squares(10.0, inlier_ratio=0.3, noise=0.3, n=600)
+    assert np.median(search) < 3 * np.median(best)
+
+
+def test_the_same_call_gives_the_same_answer_and_another_seed_other_draws():
+    X = scene_of(1, inlier_ratio=0.2, noise=1.0).X
+    first, again, other = find(X), find(X), find(X, seed=1000)
+    np.testing.assert_array_equal(first.F, again.F)
+    assert (first.votes, first.n_draws, first.reason) == (again.votes, again.n_draws, again.reason)
+    assert first.votes != other.votes
+
+
+def test_arguments_are_left_as_they_are():
+    X = scene_of(0).X
+    reliability = contrast_reliability(X)
+    copies = X.copy(), reliability.copy()
+    find(X, reliability)
+    np.testing.assert_array_equal(X, copies[0])
+    np.testing.assert_array_equal(reliability, copies[1])
+
+
+def test_ends_when_two_draws_agree():
+    """On clean matches the first rounds are enough; few right ones take more draws."""
+    n_clean, n_poor = [], []
+    for seed in SEEDS:
+        clean = find(scene_of(seed, inlier_ratio=0.9, noise=0.2).X)
+        assert "agree" in clean.reason
+        n_clean.append(clean.n_draws)
+        n_poor.append(find(scene_of(seed, n=300, inlier_ratio=0.05).X).n_draws)
+    assert max(n_clean) <= 4
+    assert np.mean(n_poor) > 1.5 * np.mean(n_clean)
+
+
+def test_two_different_answers_are_no_agreement(monkeypatch):
+    """The search goes through all its rounds when no two draws are of the same geometry."""
+    X = scene_of(0).X
+    answers = iter(np.random.default_rng(0).normal(size=(99, 3, 3)) * [1e-6, 1e-6, 1e-3])
+    monkeypatch.setattr(_consensus, "draw", lambda *_: next(answers))
+    monkeypatch.setattr(_consensus, "polish", lambda frame, G, scales: G)
+    found = find(X)
+    assert found.n_draws >= 2 * len(_consensus.ROUNDS) - 1
+    assert "best vote" in found.reason
+
+
+def test_more_than_the_reliable_part_counts():
+    """Where the reliable half is wrong as a whole, the other half still gives F."""
+    for seed in SEEDS:
+        scene = scene_of(seed, inlier_ratio=0.5)
+        # Reliability is 0.6 for wrong matches and 0.4 for right ones.
+        found = find(scene.X, np.where(scene.inliers, 0.4, 0.6))
+        assert sampson_distance(found.F, true_matches(seed)).mean() < 1.0
+
+
+def test_reliability_finds_what_is_lost_without():
+    """Ten per cent right matches, known to be: hopeless in any order, easy in the right one."""
+    known, unknown = [], []
+    for seed in range(6):
+        scene = scene_of(seed, n=500, inlier_ratio=0.1)
+        truth = true_matches(seed)
+        rank = np.random.default_rng(seed).permutation(500) / 500
+        for r, errors in ((scene.inliers * 0.9 + 0.1 * rank, known), (rank, unknown)):
+            found = find(scene.X, r, max_iters=300)
+            errors.append(sampson_distance(found.F, truth).mean())
+    assert np.median(known) < 1.0
+    assert np.median(unknown) > 3 * np.median(known)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_one_plane_does_not_win(seed):
+    """Nine tenths of the right matches on a plane: F must hold off it."""
+    X, judges = mostly_one_plane(seed)
+    assert np.median(sampson_distance(find(X).F, judges)) < 1.5
+
+
+def test_no_draw_no_answer(monkeypatch):
+    monkeypatch.setattr(_consensus, "draw", lambda *_: None)
+    assert find(scene_of(0).X) is None
+
+
+def test_draws_get_the_callers_bounds(monkeypatch):
+    asked = []
+
+    def recorded(points, threshold, confidence, max_iters, seed):
+        asked.append((threshold, confidence, max_iters, seed, len(points)))
+
+    monkeypatch.setattr(_consensus, "draw", recorded)
+    find(scene_of(0).X, threshold=2.5, confidence=0.9, max_iters=17, seed=5)
+    thresholds, confidences, iterations, seeds, sizes = zip(*asked, strict=True)
+    assert set(thresholds) == {2.5}
+    assert set(confidences) == {0.9}
+    assert max(iterations) <= 17
+    assert len(set(seeds)) == len(seeds), "each draw has a seed of its own"
+    assert min(sizes) < max(sizes) == 600, "some draws are from all matches, some from a part"
+
+
+def test_draws_are_from_the_most_reliable(monkeypatch):
+    seen = []
+    monkeypatch.setattr(_consensus, "draw", lambda points, *_: seen.append(points))
+    X = scene_of(0).X
+    reliability = np.random.default_rng(0).permutation(600) / 600
+    find(X, reliability)
+    best_first = X[np.argsort(-reliability)].astype(np.float32)
+    for points in seen:
+        np.testing.assert_array_equal(points, best_first[: len(points)])
+
+
+# The vote
+
+
+def spread_and_crowd():
+    """Twelve matches all over both images, twelve that share a spot, and two far corners."""
+    rng = np.random.default_rng(0)
+    grid = np.array([(x, y) for x in range(0, 1000, 250) for y in range(0, 750, 250)], float)
+    crowd = 100 + rng.uniform(0, 2, (12, 4))
+    return np.vstack([np.hstack([grid, grid]), crowd, np.zeros((1, 4)), np.full((1, 4), 1000.0)])
+
+
+def votes_for(X, reliability, *sets):
+    """Votes for hypotheses that each fit exactly the given rows, and miss the others by far."""
+    squared = np.full((len(sets), len(X)), 1e4)
+    for row, inliers in zip(squared, sets, strict=True):
+        row[inliers] = 0.0
+    return _Ballot(X, reliability).count(squared, 1.0)
+
+
+def test_a_crowd_counts_less_than_as_many_spread_matches():
+    X = spread_and_crowd()
+    spread, crowd = votes_for(X, np.ones(26), np.arange(12), np.arange(12, 24))
+    assert spread > 2 * crowd
+
+
+def test_a_crowd_in_one_image_counts_less_too():
+    X = spread_and_crowd()
+    mixed = X.copy()
+    mixed[:12, 2:] = X[12:24, 2:]
+    spread, crowd = votes_for(X, np.ones(26), np.arange(12), np.arange(12, 24))
+    half = votes_for(mixed, np.ones(26), np.arange(12))[0]
+    assert crowd < half < spread
+
+
+def test_every_inlier_adds_to_the_vote_and_reliable_ones_more():
+    X = spread_and_crowd()
+    less, more = votes_for(X, np.ones(26), np.arange(18), np.arange(19))
+    assert more > less
+    reliability = np.where(np.arange(26) % 2, 0.9, 0.3)
+    low, high = votes_for(X, reliability, np.arange(0, 12, 2), np.arange(1, 12, 2))
+    assert high > low
+
+
+def test_votes_fall_with_the_residual_to_nothing():
+    X = spread_and_crowd()
+    residuals = np.array([0.0, 0.1, 0.25, 0.5, 1.0, 50.0])
+    votes = _Ballot(X, np.ones(26)).count(np.tile(residuals[:, None] ** 2, 26), 1.0)
+    assert (np.diff(votes) < 0).all()
+    assert votes[-1] == 0.0
+    wider = _Ballot(X, np.ones(26)).count(np.full((1, 26), 0.25), 2.0)
+    assert wider > votes[3]
+
+
+def test_vote_does_not_change_with_the_place_order_and_unit_of_the_matches():
+    X = scene_of(0, n=100).X
+    rng = np.random.default_rng(0)
+    reliability, squared = rng.uniform(size=100), rng.uniform(0, 2, (3, 100))
+    votes = _Ballot(X, reliability).count(squared, 1.0)
+    order = rng.permutation(100)
+    shuffled = _Ballot(X[order], reliability[order]).count(squared[:, order], 1.0)
+    np.testing.assert_allclose(shuffled, votes)
+    scaled = _Ballot(4 * X + 64, reliability).count(16 * squared, 4.0)
+    np.testing.assert_allclose(scaled, votes)
+    swapped = _Ballot(X[:, [2, 3, 0, 1]], reliability).count(squared, 1.0)
+    np.testing.assert_allclose(swapped, votes)
+
+
+# The noise
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.2, 0.5, 0.9])
+@pytest.mark.parametrize("n_wrong", [0, 500])
+def test_noise_is_the_standard_deviation_of_the_right_ones_residuals(sigma, n_wrong):
+    rng = np.random.default_rng(0)
+    r = np.concatenate([rng.normal(0, sigma, 1000), rng.uniform(-100, 100, n_wrong)])
+    assert _noise(r**2, 1.0) == pytest.approx(sigma, rel=0.15)
+
+
+def test_noise_of_next_to_no_residuals_is_of_the_order_of_the_threshold():
+    for squared in (np.array([]), np.full(30, 1e6)):
+        assert 0.1 < _noise(squared, 1.0) <= 1.0
+
+
+def test_noise_of_exact_matches_is_nothing():
+    assert _noise(np.zeros(50), 1.0) == 0.0
+
+
+# Wu and Wan's RANSAC
+
+
+@pytest.mark.parametrize("ratio", [0.1, 0.5, 0.9, 0.99])
+@pytest.mark.parametrize("confidence", [0.5, 0.99, 0.9999])
+def test_number_of_samples_follows_the_papers_equation(ratio, confidence):
+    k = _samples_needed(ratio, confidence)
+    if k > 1:
+        assert (1 - ratio**8) ** k == pytest.approx(1 - confidence, rel=1e-6)
+    else:
+        assert ratio**8 >= confidence * (1 - 1e-9)
+
+
+def test_one_sample_is_enough_if_all_matches_agree_and_very_many_if_few_do():
+    assert _samples_needed(1.0, 0.99) == 1.0
+    assert _samples_needed(1e-3, 0.99) > 1e20
+
+
+def recount(found, X, threshold):
+    return int(np.count_nonzero(point_line_squared(found.F, X) <= threshold**2))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_papers_ransac_ends_by_its_equation(seed):
+    X = scene_of(seed, n=300, inlier_ratio=0.55, noise=0.0).X
+    found = eight_point_ransac(X, threshold=0.5, confidence=0.99, max_iters=100_000, seed=seed)
+    inliers = recount(found, X, 0.5)
+    assert found.votes == (inliers,)
+    assert inliers >= 160
+    # The clean sample came before the number that it asks for had been drawn.
+    assert found.n_draws == np.ceil(_samples_needed(inliers / 300, 0.99))
+
+
+def test_papers_ransac_ends_at_the_callers_bound():
+    X = scene_of(0, inlier_ratio=0.2).X
+    for bound in (1, 64, 65, 100):
+        found = eight_point_ransac(X, threshold=1.0, confidence=0.999, max_iters=bound, seed=0)
+        assert found is None or found.n_draws == bound
+
+
+def test_papers_ransac_needs_one_sample_of_exact_matches():
+    found = eight_point_ransac(
+        true_matches(0), threshold=1.0, confidence=0.99, max_iters=1000, seed=0
+    )
+    assert found.n_draws <= 3
+    assert sampson_distance(found.F, true_matches(0)).max() < 1.0
+
+
+def test_papers_ransac_returns_a_samples_f_not_a_fit():
+    """Eight matches are met much better than the other right ones."""
+    scene = scene_of(0, n=100, inlier_ratio=1.0, noise=1.0)
+    found = eight_point_ransac(scene.X, threshold=3.0, confidence=0.99, max_iters=100, seed=0)
+    refined = find(scene.X)
+    truth = true_matches(0)
+    assert sampson_distance(found.F, truth).mean() > sampson_distance(refined.F, truth).mean()
+
+
+def test_papers_ransac_is_seeded():
+    X = scene_of(0, inlier_ratio=0.5).X
+    F = [
+        eight_point_ransac(X, threshold=1.0, confidence=0.99, max_iters=70, seed=seed).F
+        for seed in (0, 0, 1)
+    ]
+    np.testing.assert_array_equal(F[0], F[1])
+    assert not np.array_equal(F[0], F[2])
+
+
+def test_papers_ransac_draws_without_repetition(monkeypatch):
+    seen = []
+
+    def recorded(samples):
+        seen.append(samples)
+        return np.tile(np.eye(3), (len(samples), 1, 1))
+
+    monkeypatch.setattr(_consensus, "eight_point", recorded)
+    X = np.arange(40.0).reshape(10, 4)
+    eight_point_ransac(X, threshold=1e-9, confidence=0.99, max_iters=500, seed=0)
+    rows = np.concatenate(seen)[:, :, 0] / 4
+    assert rows.shape == (500, 8)
+    assert all(len(set(row)) == 8 for row in rows)
+    counts = np.bincount(rows.ravel().astype(int), minlength=10)
+    spread = norm.ppf(1 - 1e-6) * np.sqrt(500 * 0.8 * 0.2)
+    np.testing.assert_allclose(counts, 400, atol=spread)
+
+
+@pytest.mark.parametrize("n", [0, 7])
+def test_papers_ransac_needs_eight_matches(n):
+    assert (
+        eight_point_ransac(
+            true_matches(0)[:n], threshold=1.0, confidence=0.99, max_iters=10, seed=0
+        )
+        is None
+    )
