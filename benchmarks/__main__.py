@@ -1,4 +1,4 @@
-"""``python -m benchmarks real | synthetic | stages``."""
+"""``python -m benchmarks real | synthetic | stages | paper``."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from benchmarks import report
 from benchmarks.data import Pair, load_pairs
+from benchmarks.paper import reproduce
 from benchmarks.peers import METHODS, Method, Settings, choose
 from benchmarks.run import Record, measure, one_thread, warm_up
 from benchmarks.scenes import KINDS, make_scene, scenes
@@ -80,6 +81,15 @@ def _parser() -> argparse.ArgumentParser:
     stages.add_argument("--method", default="usac_accurate")
     stages.add_argument("--repeats", type=int, default=10, metavar="N")
     stages.set_defaults(run=_stages)
+
+    paper = commands.add_parser("paper", help="the tables and figures of Wu and Wan")
+    paper.add_argument("--quick", action="store_true", help="two pairs, nothing rendered")
+    paper.add_argument("--data", metavar="DIR", help="folder of .npz files with more real pairs")
+    paper.add_argument("--out", metavar="DIR", help="write the report, every trial and the plots")
+    paper.add_argument(
+        "--seeds", type=int, default=5, metavar="N", help="draws of each pair's matches (default 5)"
+    )
+    paper.set_defaults(run=_paper)
     return parser
 
 
@@ -165,6 +175,11 @@ def _stages(args: argparse.Namespace) -> int:
     for stage, by_n in times.items():
         print(f"| {stage} | {' | '.join(_median(by_n[n], '.2f') for n in args.n)} |")
     print(f"| number of draws | {' | '.join(_median(draws[n], '.0f') for n in args.n)} |")
+    return 0
+
+
+def _paper(args: argparse.Namespace) -> int:
+    print(reproduce(args.data, args.out, args.seeds, args.quick))
     return 0
 
 

@@ -286,12 +286,13 @@ def eight_point_ransac(
     needed: float = max_iters
     while drawn < needed:
         size = min(_BATCH, max_iters - drawn)
-        samples = rng.permuted(np.broadcast_to(np.arange(n), (size, n)), axis=1)[:, :8]
-        for F in eight_point(X[samples]):
+        samples = rng.random((size, n)).argpartition(7, axis=1)[:, :8]
+        F = eight_point(X[samples])
+        counts = np.count_nonzero(point_line_squared(F, X) <= threshold * threshold, axis=1)
+        for candidate, inliers in zip(F, counts.tolist(), strict=True):
             drawn += 1
-            inliers = int(np.count_nonzero(point_line_squared(F, X) <= threshold * threshold))
             if inliers > most:
-                best, most = F, inliers
+                best, most = candidate, inliers
                 needed = min(max_iters, _samples_needed(inliers / n, confidence))
             if drawn >= needed:
                 break

@@ -33,15 +33,16 @@ def _sampson_squared(F: Floats, X: Floats) -> Floats:
 
 
 def point_line_squared(F: Floats, X: Floats) -> Floats:
-    """Larger of the two squared point-to-epipolar-line distances, (n,) float64."""
+    """Larger of the two squared point-to-line distances under each of F (..., 3, 3), (..., n)."""
     x, y, u, v = X.astype(np.float32).astype(np.float64).T
-    a = F[0, 0] * x + F[0, 1] * y + F[0, 2]
-    b = F[1, 0] * x + F[1, 1] * y + F[1, 2]
-    c = F[2, 0] * x + F[2, 1] * y + F[2, 2]
+    F = F[..., None]
+    a = F[..., 0, 0, :] * x + F[..., 0, 1, :] * y + F[..., 0, 2, :]
+    b = F[..., 1, 0, :] * x + F[..., 1, 1, :] * y + F[..., 1, 2, :]
+    c = F[..., 2, 0, :] * x + F[..., 2, 1, :] * y + F[..., 2, 2, :]
     in_second = u * a + v * b + c
-    d = F[0, 0] * u + F[1, 0] * v + F[2, 0]
-    e = F[0, 1] * u + F[1, 1] * v + F[2, 1]
-    f = F[0, 2] * u + F[1, 2] * v + F[2, 2]
+    d = F[..., 0, 0, :] * u + F[..., 1, 0, :] * v + F[..., 2, 0, :]
+    e = F[..., 0, 1, :] * u + F[..., 1, 1, :] * v + F[..., 2, 1, :]
+    f = F[..., 0, 2, :] * u + F[..., 1, 2, :] * v + F[..., 2, 2, :]
     in_first = x * d + y * e + f
     # cv2 multiplies by the reciprocal.
     squared1 = in_first * in_first * (1.0 / (d * d + e * e))
