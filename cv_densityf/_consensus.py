@@ -18,7 +18,7 @@ Bools = NDArray[np.bool_]
 #: Draws from the matches within a few thresholds of the best hypothesis so far, dense or not.
 NEAR = 0.0
 #: Shares of the matches, most reliable first, that hypotheses are drawn from, round by round.
-ROUNDS = ((0.25, 0.5), (1.0, NEAR), (0.125, NEAR), (0.5, NEAR), (0.25, 1.0))
+ROUNDS = ((0.25, 0.5), (0.75, NEAR), (0.125, 1.0), (0.5, NEAR), (0.25, 1.0))
 _NEAR_WIDTH = 8.0
 #: Matches a draw gets at least: fewer crowd on too little of the image to fix F.
 MIN_DRAW = 40
