@@ -213,12 +213,12 @@ def rough(rng: np.random.Generator, size: int) -> Image:
         image += cv2.resize(noise, (size, size), interpolation=cv2.INTER_CUBIC) / octave**0.1
         octave *= 2
     image = (image - image.mean()) / image.std()
-    return np.clip(np.rint(128 + 45 * image), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(128 + 45 * image), 0, 255), dtype=np.uint8)
 
 
 def printed(rng: np.random.Generator, size: int) -> Image:
     """Make a texture of shapes and letters over noise."""
-    image: Image = rough(rng, size) // 2 + rng.integers(30, 100, 3).astype(np.uint8)
+    image = rough(rng, size) // 2 + rng.integers(30, 100, 3).astype(np.uint8)
     for _ in range(size // 4):
         x, y = (int(v) for v in rng.integers(0, size, 2))
         extent = int(size * rng.uniform(0.005, 0.05))
@@ -232,7 +232,7 @@ def printed(rng: np.random.Generator, size: int) -> Image:
         else:
             letters = "".join(chr(65 + int(c)) for c in rng.integers(0, 26, 3))
             cv2.putText(image, letters, (x, y), 2, size / 800, color, 2, cv2.LINE_AA)
-    return image
+    return np.asarray(image, dtype=np.uint8)
 
 
 def bricks(rng: np.random.Generator, size: int) -> Image:
