@@ -1,0 +1,555 @@
+"""The whole pipeline: what holds for every method, every input, and every answer."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import FrozenInstanceError
+
+import cv2
+import numpy as np
+import pytest
+from scipy.stats import spearmanr
+
+from cv_densityf import Estimate, estimate_fundamental
+from cv_densityf._engine import METHODS, Robust, original
+from cv_densityf._epipolar import inlier_mask, sampson_distance
+from cv_densityf._estimate import MIN_FILTERED, run
+from cv_densityf.datasets import two_view_scene
+
+ROBUST = [name for name in METHODS if name not in ("7point", "8point")]
+#: One method for each rule of the mask.
+RULES = ["usac_accurate", "ransac", "lmeds"]
+DENSITIES = ["contrast", "paper"]
+
+
+def scene_of(seed=0, n=400, inlier_ratio=0.4, noise=0.5):
+    return two_view_scene(n, inlier_ratio=inlier_ratio, noise=noise, random_state=seed)
+
+
+def true_matches(seed):
+    return two_view_scene(400, inlier_ratio=1.0, noise=0.0, random_state=seed).X
+
+
+def estimate(X, **options):
+    return estimate_fundamental(X[:, :2], X[:, 2:], **options)
+
+
+def rule_of(method):
+    return Robust(METHODS[method], 1.0, 0.99, 1).rule
+
+
+def assert_whole(result, n):
+    """What every estimate has, whatever went in."""
+    assert isinstance(result, Estimate)
+    assert bool(result) == (result.F is not None)
+    for flags in (result.mask, result.kept):
+        assert flags.shape == (n,)
+        assert flags.dtype == bool
+    assert result.reliability.shape == (n,)
+    known = result.reliability[~np.isnan(result.reliability)]
+    assert ((known >= 0) & (known <= 1)).all()
+    assert result.reason
+    assert result.n_inliers == result.mask.sum()
+    assert all(ms >= 0 for ms in result.timings.values())
+    if result:
+        assert result.F.dtype == np.float64
+        assert result.F.shape[1:] == (3,)
+        assert np.isfinite(result.F).all()
+    else:
+        assert not result.mask.any()
+
+
+def assert_same(first, second):
+    np.testing.assert_array_equal(first.F, second.F)
+    np.testing.assert_array_equal(first.mask, second.mask)
+    np.testing.assert_array_equal(first.kept, second.kept)
+    np.testing.assert_array_equal(first.reliability, second.reliability)
+    assert (first.n_draws, first.engine, first.reason) == (
+        second.n_draws,
+        second.engine,
+        second.reason,
+    )
+    assert first.votes == second.votes
+
+
+# What an estimate is
+
+
+def test_an_estimate_is_truthy_with_f_and_cannot_be_changed():
+    result = estimate(scene_of().X)
+    assert result
+    assert_whole(result, 400)
+    with pytest.raises(FrozenInstanceError):
+        result.F = None
+    assert f"{result.n_inliers} inliers of 400" in repr(result)
+    assert result.reason in repr(result)
+
+
+def test_no_f_is_falsy_with_a_reason():
+    result = estimate(np.ones((40, 4)))
+    assert not result
+    assert_whole(result, 40)
+    assert "on a line" in result.reason
+    assert "degenerate" in result.reason
+    assert "no F" in repr(result)
+
+
+def test_timings_are_of_the_stages_that_ran():
+    searched = estimate(scene_of().X).timings
+    assert set(searched) == {"density", "draws", "polish", "mask"}
+    assert set(estimate(scene_of().X, density="off").timings) == {"draws"}
+
+
+def test_votes_and_draws_are_told():
+    result = estimate(scene_of().X)
+    assert result.engine == "density"
+    assert 0 < len(result.votes) <= result.n_draws
+    assert estimate(scene_of().X, density="off").n_draws == 0
+
+
+def test_arguments_are_left_as_they_are():
+    scene = scene_of()
+    points = scene.points1.copy(), scene.points2.copy()
+    scores = np.random.default_rng(0).uniform(size=400)
+    kept = scores.copy()
+    estimate_fundamental(scene.points1, scene.points2, scores=scores)
+    np.testing.assert_array_equal(scene.points1, points[0])
+    np.testing.assert_array_equal(scene.points2, points[1])
+    np.testing.assert_array_equal(scores, kept)
+
+
+# What it finds
+
+
+@pytest.mark.parametrize("method", ROBUST)
+def test_every_robust_method_finds_the_geometry(method):
+    errors = []
+    for seed in range(3):
+        # The median's method takes half of the matches for right, come what may.
+        scene = scene_of(seed, 500, 0.6 if method == "lmeds" else 0.35)
+        result = estimate(scene.X, method=method)
+        assert_whole(result, 500)
+        errors.append(sampson_distance(result.F, true_matches(seed)).mean())
+        assert result.mask[scene.inliers].mean() > 0.6
+        assert result.mask[~scene.inliers].mean() < 0.1
+    assert np.median(errors) < 0.5
+
+
+def test_finds_more_than_cv2_where_few_matches_are_right():
+    """Fifteen per cent: cv2's RANSAC is lost, and its USAC often."""
+    ours, ransac = [], []
+    for seed in range(8):
+        scene = scene_of(seed, 500, 0.15)
+        truth = true_matches(seed)
+        ours.append(sampson_distance(estimate(scene.X).F, truth).mean())
+        plain = estimate(scene.X, method="ransac", density="off")
+        ransac.append(sampson_distance(plain.F, truth).mean() if plain else np.inf)
+    assert np.median(ours) < 1.0
+    assert np.median(ransac) > 3 * np.median(ours)
+
+
+@pytest.mark.parametrize("method", RULES)
+@pytest.mark.parametrize("density", DENSITIES)
+def test_the_mask_is_the_rule_on_all_rows_dropped_ones_too(method, density):
+    for seed in range(3):
+        scene = scene_of(seed, 500, 0.5)
+        for threshold in (0.7, 3.0):
+            result = estimate(
+                scene.X, method=method, threshold=threshold, density=density, max_iters=500
+            )
+            expected = inlier_mask(result.F, scene.X, rule_of(method), threshold)
+            np.testing.assert_array_equal(result.mask, expected)
+            assert (result.mask & ~result.kept).any()
+
+
+def test_scores_find_what_density_alone_does_not():
+    """Five per cent right, which the scores know about."""
+    found = {True: 0, False: 0}
+    for seed in range(6):
+        scene = scene_of(seed, 600, 0.05)
+        rng = np.random.default_rng(seed)
+        scores = np.where(scene.inliers, rng.beta(8, 2, 600), rng.beta(2, 8, 600))
+        for known in found:
+            result = estimate(scene.X, scores=scores if known else None)
+            found[known] += sampson_distance(result.F, true_matches(seed)).mean() < 2
+    assert found[True] >= 5
+    assert found[True] > found[False]
+
+
+def test_paper_rule_keeps_and_draws_as_the_paper_says():
+    X = scene_of(0, 400, 0.6).X
+    result = estimate(X, density="paper", method="ransac")
+    assert result.engine == "density"
+    assert result.reliability.max() <= 1.0
+    np.testing.assert_array_equal(result.kept, result.reliability >= 0.011)
+    assert f"of the {result.kept.sum()} matches" in result.reason
+    less = estimate(X, density="paper", method="ransac", alpha=0.02)
+    assert less.engine == "density"
+    assert less.kept.sum() < result.kept.sum()
+    coarse = estimate(X, density="paper", method="ransac", dc_percent=20.0)
+    assert not np.array_equal(coarse.reliability, result.reliability)
+
+
+# When cv2 answers
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_density_off_is_cv2s_own_answer(method):
+    X = scene_of(1).X
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # USAC_PARALLEL answers the same twice on one thread only
+    try:
+        result = estimate(X, method=method, density="off", threshold=1.5, max_iters=300)
+        F, mask = original(X[:, :2], X[:, 2:], METHODS[method], 1.5, 0.999, 300)
+    finally:
+        cv2.setNumThreads(threads)
+    np.testing.assert_array_equal(result.F, F)
+    np.testing.assert_array_equal(result.mask, mask.ravel().astype(bool))
+    assert result.engine == method
+    assert "density is off" in result.reason
+
+
+@pytest.mark.parametrize("method", ["7point", "8point"])
+def test_direct_methods_are_never_filtered(method):
+    X = scene_of(1).X
+    result = estimate(X, method=method)
+    F, mask = original(X[:, :2], X[:, 2:], METHODS[method], 1.0, 0.999, 5000)
+    np.testing.assert_array_equal(result.F, F)
+    np.testing.assert_array_equal(result.mask, mask.ravel().astype(bool))
+    assert method in result.reason
+
+
+@pytest.mark.parametrize("n", range(21))
+def test_any_small_number_of_matches_has_an_answer(n):
+    X = scene_of(0, 60, 0.8).X[:n]
+    for method in ("usac_accurate", "usac_fm_8pts", "ransac", "lmeds", "8point"):
+        for density in DENSITIES:
+            result = estimate(X, method=method, density=density)
+            assert_whole(result, n)
+            if n >= MIN_FILTERED:
+                continue
+            assert result.engine == method
+            F, mask = Robust(METHODS[method], 1.0, 0.999, 5000).plain(X[:, :2], X[:, 2:])
+            np.testing.assert_array_equal(result.F, F)
+            if F is not None:
+                np.testing.assert_array_equal(result.mask, mask.ravel().astype(bool))
+            assert (n >= 7) or not result
+
+
+def test_seven_matches_have_up_to_three_matrices_below_each_other():
+    X = true_matches(0)[:7]
+    F = estimate(X, method="ransac").F
+    assert F.shape == (9, 3)
+    for one in F.reshape(3, 3, 3):
+        assert sampson_distance(one, X).max() < 1e-2
+
+
+def test_where_no_draw_holds_cv2_answers(monkeypatch):
+    X = scene_of().X
+    monkeypatch.setattr("cv_densityf._consensus.draw", lambda *_: None)
+    result = estimate(X, method="ransac")
+    F, mask = original(X[:, :2], X[:, 2:], cv2.FM_RANSAC, 1.0, 0.999, 5000)
+    np.testing.assert_array_equal(result.F, F)
+    np.testing.assert_array_equal(result.mask, mask.ravel().astype(bool))
+    assert (result.engine, result.n_draws) == ("ransac", 0)
+    assert "no draw" in result.reason
+
+
+def test_a_singular_least_squares_problem_is_no_exception(monkeypatch):
+    def singular(*_, **__):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr("cv_densityf._consensus.polish", singular)
+    result = estimate(scene_of().X)
+    assert result.engine == "usac_accurate"
+    assert_whole(result, 400)
+
+
+# Inputs of every kind
+
+
+@pytest.mark.parametrize("method", RULES)
+@pytest.mark.parametrize("density", [*DENSITIES, "off"])
+def test_rows_that_are_not_numbers_change_nothing_for_the_others(method, density):
+    scene = scene_of(2, 300, 0.6)
+    bad = np.random.default_rng(0).choice(340, 40, replace=False)
+    finite = np.ones(340, dtype=bool)
+    finite[bad] = False
+    X = np.empty((340, 4))
+    X[finite] = scene.X
+    X[bad] = 100.0
+    X[bad, np.arange(40) % 4] = np.resize([np.nan, np.inf, -np.inf], 40)
+    options = {"method": method, "density": density, "max_iters": 300}
+    whole, alone = estimate(X, **options), estimate(scene.X, **options)
+    assert_whole(whole, 340)
+    np.testing.assert_array_equal(whole.F, alone.F)
+    np.testing.assert_array_equal(whole.mask[finite], alone.mask)
+    np.testing.assert_array_equal(whole.kept[finite], alone.kept)
+    assert not whole.mask[bad].any()
+    assert not whole.kept[bad].any()
+
+
+def test_scores_of_rows_that_are_not_numbers_do_not_matter():
+    scene = scene_of(2, 300, 0.3)
+    scores = np.random.default_rng(0).uniform(size=300)
+    X, trust = scene.X.copy(), scores.copy()
+    X[:50, 1] = np.nan
+    trust[:50] = 1e9
+    whole = estimate(X, scores=trust)
+    np.testing.assert_array_equal(whole.F, estimate(scene.X[50:], scores=scores[50:]).F)
+
+
+def test_nothing_but_bad_rows_is_no_f():
+    assert_whole(result := estimate(np.full((50, 4), np.nan)), 50)
+    assert not result
+
+
+HOMOGRAPHY = np.array([[1.05, 0.1, 5.0], [-0.1, 1.1, 3.0], [1e-4, 0.0, 1.0]])
+
+
+def one_plane():
+    first = np.random.default_rng(0).uniform(0, 1000, (200, 2))
+    second = cv2.perspectiveTransform(first[None], HOMOGRAPHY)[0]
+    return np.hstack([first, second])
+
+
+def degenerate():
+    rng = np.random.default_rng(0)
+    first = rng.uniform(0, 1000, (200, 2))
+    line = np.c_[first[:, 0], 2 * first[:, 0] + 7]
+    return {
+        "all equal": np.full((200, 4), 5.0),
+        "all zero": np.zeros((200, 4)),
+        "line in both": np.hstack([line, line + 3]),
+        "line in the first": np.hstack([line, first]),
+        "line in the second": np.hstack([first, line]),
+        "equal in the second": np.hstack([first, np.ones((200, 2))]),
+        "same points": np.hstack([first, first]),
+        "translation": np.hstack([first, first + np.array([30, 7])]),
+        "one plane": one_plane(),
+        "three places": np.repeat(rng.uniform(0, 1000, (3, 4)), 60, axis=0),
+        "eight places": np.repeat(rng.uniform(0, 1000, (8, 4)), 30, axis=0),
+        "half equal": np.vstack([rng.uniform(0, 1000, (100, 4)), np.zeros((100, 4))]),
+        "chance": rng.uniform(0, 1000, (200, 4)),
+        "tiny": rng.uniform(0, 1e-30, (200, 4)),
+        "huge": rng.uniform(0, 1e30, (200, 4)),
+    }
+
+
+@pytest.mark.parametrize("kind", degenerate())
+@pytest.mark.parametrize("method", [*RULES, "usac_magsac"])
+def test_degenerate_matches_raise_nothing(kind, method):
+    X = degenerate()[kind]
+    for density in DENSITIES:
+        result = estimate(X, method=method, density=density, max_iters=200)
+        assert_whole(result, len(X))
+
+
+@pytest.mark.parametrize("method", RULES)
+@pytest.mark.parametrize("kind", ["same points", "translation", "one plane"])
+def test_all_matches_of_one_homography_are_inliers(kind, method):
+    """Many F explain them, and any that does is right."""
+    X = degenerate()[kind]
+    result = estimate(X, method=method)
+    assert result
+    assert result.mask.mean() > (0.9 if method == "lmeds" else 0.999)
+
+
+def test_classic_methods_find_no_f_on_a_line_as_cv2_does():
+    for kind in ("all equal", "line in both", "line in the first", "line in the second"):
+        X = degenerate()[kind]
+        assert original(X[:, :2], X[:, 2:], cv2.FM_RANSAC, 1.0, 0.99, 500)[0] is None
+        assert not estimate(X, method="ransac")
+
+
+@pytest.mark.parametrize("offset", [1e4, 1e5])
+@pytest.mark.parametrize("method", ["usac_accurate", "ransac"])
+def test_large_coordinates_cost_no_accuracy(offset, method):
+    back = np.array([[1, 0, offset], [0, 1, offset], [0, 0, 1]])
+    errors = []
+    for seed in range(4):
+        result = estimate(scene_of(seed).X + offset, method=method)
+        errors.append(sampson_distance(back.T @ result.F @ back, true_matches(seed)).mean())
+    assert np.median(errors) < 0.4
+
+
+def test_very_large_coordinates_are_no_error():
+    X = scene_of().X + 1e6
+    for method in ROBUST:
+        assert_whole(estimate(X, method=method, max_iters=200), 400)
+
+
+def test_float16_and_integers_are_points_too():
+    scene = scene_of(0, 500, 0.5)
+    for dtype in (np.float16, np.float32, np.int16, np.int64, np.uint16):
+        first, second = (p.round().astype(dtype) for p in (scene.points1, scene.points2))
+        result = estimate_fundamental(first, second, threshold=2.0)
+        same = estimate_fundamental(first.astype(float), second.astype(float), threshold=2.0)
+        assert_same(result, same)
+        assert sampson_distance(result.F, true_matches(0)).mean() < 2
+
+
+def test_lists_and_cv2s_shapes_are_points_too():
+    scene = scene_of()
+    expected = estimate(scene.X)
+    p, q = scene.points1, scene.points2
+    for shaped in ((p[:, None], q[:, None]), (p[None], q[None]), (p.tolist(), q[:, None].tolist())):
+        assert_same(estimate_fundamental(*shaped), expected)
+    fortran = np.asfortranarray(scene.X)
+    result = estimate_fundamental(fortran[:, :2], fortran[:, 2:])
+    np.testing.assert_allclose(result.F, expected.F, rtol=1e-6)
+    np.testing.assert_array_equal(result.mask, expected.mask)
+    assert_same(estimate_fundamental(p[::-1][::-1], q.copy()), expected)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_very_many_matches(method):
+    scene = scene_of(0, 20_000, 0.5)
+    result = estimate(scene.X, method=method, max_iters=100)
+    assert_whole(result, 20_000)
+    if method in ROBUST:
+        assert sampson_distance(result.F, true_matches(0)).mean() < 0.3
+        expected = inlier_mask(result.F, scene.X, rule_of(method), 1.0)
+        np.testing.assert_array_equal(result.mask, expected)
+
+
+def test_a_searched_part_is_told_by_the_reliability():
+    """Rows the search did not look at have no reliability, and their place in the mask."""
+    scene = scene_of(0, 20_000, 0.5)
+    result = estimate(scene.X)
+    unseen = np.isnan(result.reliability)
+    assert unseen.any()
+    assert not result.kept[unseen].any()
+    assert result.mask[unseen & scene.inliers].mean() > 0.5
+    other = estimate(scene.X, random_state=1)
+    assert not np.array_equal(unseen, np.isnan(other.reliability))
+
+
+# Symmetries and repetition
+
+
+@pytest.mark.parametrize("method", [*RULES, "usac_parallel"])
+@pytest.mark.parametrize("density", DENSITIES)
+def test_the_same_call_gives_the_same_answer(method, density):
+    X = scene_of(3, 300, 0.3).X
+    options = {"method": method, "density": density, "max_iters": 300}
+    assert_same(estimate(X, **options), estimate(X, **options))
+
+
+def test_the_seed_is_random_state_and_nothing_else():
+    X = scene_of(3, 300, 0.15, noise=1.0).X
+    first = estimate(X, random_state=3)
+    np.random.seed(1)  # noqa: NPY002
+    cv2.setRNGSeed(7)
+    assert_same(estimate(X, random_state=3), first)
+    others = [estimate(X, random_state=seed).votes for seed in range(4)]
+    assert len(set(others)) == 4
+
+
+def test_the_largest_seed_is_a_seed():
+    X = scene_of(3, 300, 0.05).X
+    for density in DENSITIES:
+        result = estimate(X, random_state=2**31 - 1, density=density, max_iters=100)
+        assert_whole(result, 300)
+
+
+def test_threads_get_the_same_answers():
+    Xs = [scene_of(seed, 300, 0.3).X for seed in range(8)]
+    with ThreadPoolExecutor(4) as pool:
+        parallel = list(pool.map(estimate, Xs * 2))
+    for one, other in zip(parallel, [estimate(X) for X in Xs] * 2, strict=True):
+        assert_same(one, other)
+
+
+@pytest.mark.parametrize("method", RULES)
+def test_swapped_images_have_the_transposed_matrix(method):
+    for seed in range(4):
+        scene = scene_of(seed, 500, 0.5)
+        there = estimate(scene.X, method=method)
+        back = estimate(scene.X[:, [2, 3, 0, 1]], method=method)
+        gap = [sampson_distance(F, true_matches(seed)) for F in (there.F, back.F.T)]
+        assert np.abs(gap[0] - gap[1]).mean() < 0.3
+        assert (there.mask & back.mask).sum() > 0.9 * (there.mask | back.mask).sum()
+
+
+def test_the_order_of_the_matches_hardly_matters():
+    """Draws differ, the geometry does not; reliability goes with its match."""
+    scene = scene_of(1, 500, 0.3)
+    rng = np.random.default_rng(0)
+    first = estimate(scene.X)
+    for _ in range(8):
+        order = rng.permutation(500)
+        result = estimate(scene.X[order])
+        assert sampson_distance(result.F, true_matches(1)).mean() < 0.5
+        mask = np.empty(500, dtype=bool)
+        mask[order] = result.mask
+        assert (mask & first.mask).sum() > 0.85 * (mask | first.mask).sum()
+        # Matches that share no neighbour tie, and ties are broken by row.
+        assert spearmanr(result.reliability, first.reliability[order]).statistic > 0.8
+
+
+# Refusals
+
+
+GOOD = np.zeros((20, 2))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"threshold": 0}, "threshold is 0; it must be .* above 0"),
+        ({"threshold": -1.0}, "threshold is -1.0"),
+        ({"threshold": np.nan}, "threshold is nan"),
+        ({"threshold": np.inf}, "threshold is inf"),
+        ({"confidence": 0.0}, "confidence is 0.0; it must be between 0 and 1"),
+        ({"confidence": 1.0}, "confidence is 1.0"),
+        ({"confidence": np.nan}, "confidence is nan"),
+        ({"max_iters": 0}, "max_iters is 0; it must be at least 1"),
+        ({"density": "on"}, "density is 'on'; it must be contrast, paper or off"),
+        ({"density": None}, "density is None"),
+        ({"alpha": -0.1}, "alpha is -0.1; it must be from 0 to 1"),
+        ({"alpha": 1.5}, "alpha is 1.5"),
+        ({"alpha": np.nan}, "alpha is nan"),
+        ({"dc_percent": 0}, "dc_percent is 0; it must be above 0"),
+        ({"dc_percent": 101}, "dc_percent is 101"),
+        ({"random_state": -1}, "random_state is -1; it must be an integer from 0"),
+        ({"random_state": 2**31}, "random_state is 2147483648"),
+        ({"random_state": 0.5}, "random_state is 0.5"),
+        ({"random_state": None}, "random_state is None"),
+        ({"method": "magsac"}, "unknown method 'magsac'; choose one of .*usac_magsac"),
+        ({"method": 77}, "unknown method 77; choose one of"),
+        ({"scores": np.zeros(19)}, "scores has 19 entries for 20 matches"),
+        ({"scores": np.full(20, np.nan)}, "scores has NaN; give .* the lowest score"),
+    ],
+)
+def test_wrong_options_are_named_with_what_to_do(options, message):
+    with pytest.raises(ValueError, match=message):
+        estimate_fundamental(GOOD, GOOD, **options)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "message"),
+    [
+        (GOOD, GOOD[:19], "points1 has 20 points and points2 19; row i .* one match"),
+        (GOOD.T, GOOD.T, r"points1 has shape \(2, 20\); it must be \(n, 2\)"),
+        (GOOD, np.zeros((20, 3)), r"points2 has shape \(20, 3\)"),
+        (np.zeros((20, 4)), GOOD, r"points1 has shape \(20, 4\)"),
+        (GOOD.ravel(), GOOD, r"points1 has shape \(40,\)"),
+        (np.zeros((5, 4, 2)), GOOD, r"points1 has shape \(5, 4, 2\)"),
+    ],
+)
+def test_wrong_points_are_named_with_what_to_do(first, second, message):
+    with pytest.raises(ValueError, match=message):
+        estimate_fundamental(first, second)
+
+
+def test_run_takes_params_and_their_rule():
+    """The inner entry, as the drop-in calls it with ``cv2.UsacParams``."""
+    params = cv2.UsacParams()
+    params.threshold = 2.0
+    X = scene_of().X
+    result = run(X, Robust(cv2.USAC_DEFAULT, 2.0, 0.99, 1000, params))
+    np.testing.assert_array_equal(result.mask, inlier_mask(result.F, X, "usac", 2.0))
+    plain = run(X, Robust(cv2.USAC_DEFAULT, 2.0, 0.99, 1000, params), density="off")
+    np.testing.assert_array_equal(plain.F, original(X[:, :2], X[:, 2:], params)[0])
+    assert plain.engine == "usac"
