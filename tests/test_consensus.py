@@ -127,7 +127,6 @@ def test_ends_when_two_draws_agree():
     n_clean, n_poor = [], []
     for seed in SEEDS:
         clean = find(scene_of(seed, inlier_ratio=0.9, noise=0.2).X)
-        assert "agree" in clean.reason
         n_clean.append(clean.n_draws)
         n_poor.append(find(scene_of(seed, n=300, inlier_ratio=0.05).X).n_draws)
     assert max(n_clean) <= 4
@@ -142,7 +141,7 @@ def test_two_different_answers_are_no_agreement(monkeypatch):
     monkeypatch.setattr(_consensus, "polish", lambda frame, G, scales: G)
     found = find(X)
     assert found.n_draws >= 2 * len(_consensus.ROUNDS) - 1
-    assert "best vote" in found.reason
+    assert len(found.votes) == found.n_draws
 
 
 def test_more_than_the_reliable_part_counts():
@@ -202,9 +201,11 @@ def test_draws_are_from_the_most_reliable(monkeypatch):
     X = scene_of(0).X
     reliability = np.random.default_rng(0).permutation(600) / 600
     find(X, reliability)
-    best_first = X[np.argsort(-reliability)].astype(np.float32)
+    best_first = X[np.argsort(-reliability)]
     for points in seen:
-        np.testing.assert_array_equal(points, best_first[: len(points)])
+        # Where the origin is does not matter.
+        expected = best_first[: len(points)] - best_first[0]
+        np.testing.assert_allclose(points - points[0], expected, atol=1e-3)
 
 
 # The vote

@@ -333,6 +333,7 @@ def degenerate():
         "chance": rng.uniform(0, 1000, (200, 4)),
         "tiny": rng.uniform(0, 1e-30, (200, 4)),
         "huge": rng.uniform(0, 1e30, (200, 4)),
+        "beyond float32": rng.uniform(0, 1e200, (200, 4)),
     }
 
 
@@ -362,13 +363,12 @@ def test_classic_methods_find_no_f_on_a_line_as_cv2_does():
         assert not estimate(X, method="ransac")
 
 
-@pytest.mark.parametrize("offset", [1e4, 1e5])
-@pytest.mark.parametrize("method", ["usac_accurate", "ransac"])
-def test_large_coordinates_cost_no_accuracy(offset, method):
+@pytest.mark.parametrize("offset", [1e4, 1e6])
+def test_large_coordinates_cost_no_accuracy(offset):
     back = np.array([[1, 0, offset], [0, 1, offset], [0, 0, 1]])
     errors = []
     for seed in range(4):
-        result = estimate(scene_of(seed).X + offset, method=method)
+        result = estimate(scene_of(seed).X + offset, method="ransac")
         errors.append(sampson_distance(back.T @ result.F @ back, true_matches(seed)).mean())
     assert np.median(errors) < 0.4
 
@@ -497,20 +497,22 @@ GOOD = np.zeros((20, 2))
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"threshold": 0}, "threshold is 0; it must be .* above 0"),
+        ({"threshold": 0}, "threshold is 0; it must be .*above 0"),
         ({"threshold": -1.0}, "threshold is -1.0"),
         ({"threshold": np.nan}, "threshold is nan"),
         ({"threshold": np.inf}, "threshold is inf"),
-        ({"confidence": 0.0}, "confidence is 0.0; it must be between 0 and 1"),
+        ({"confidence": 0.0}, "confidence is 0.0; it must be "),
         ({"confidence": 1.0}, "confidence is 1.0"),
         ({"confidence": np.nan}, "confidence is nan"),
-        ({"max_iters": 0}, "max_iters is 0; it must be at least 1"),
-        ({"density": "on"}, "density is 'on'; it must be contrast, paper or off"),
+        ({"max_iters": 0}, "max_iters is 0; it must be .*at least 1"),
+        ({"threshold": "1"}, "threshold is '1'; it must be "),
+        ({"max_iters": 100.5}, "max_iters is 100.5; it must be "),
+        ({"density": "on"}, "density is 'on'; it must be .*contrast, paper"),
         ({"density": None}, "density is None"),
-        ({"alpha": -0.1}, "alpha is -0.1; it must be from 0 to 1"),
+        ({"alpha": -0.1}, "alpha is -0.1; it must be .*from 0 to 1"),
         ({"alpha": 1.5}, "alpha is 1.5"),
         ({"alpha": np.nan}, "alpha is nan"),
-        ({"dc_percent": 0}, "dc_percent is 0; it must be above 0"),
+        ({"dc_percent": 0}, "dc_percent is 0; it must be "),
         ({"dc_percent": 101}, "dc_percent is 101"),
         ({"random_state": -1}, "random_state is -1; it must be an integer from 0"),
         ({"random_state": 2**31}, "random_state is 2147483648"),
@@ -518,6 +520,8 @@ GOOD = np.zeros((20, 2))
         ({"random_state": None}, "random_state is None"),
         ({"method": "magsac"}, "unknown method 'magsac'; choose one of .*usac_magsac"),
         ({"method": 77}, "unknown method 77; choose one of"),
+        ({"method": 8.0}, "unknown method 8.0; choose one of"),
+        ({"method": None}, "unknown method None; choose one of"),
         ({"scores": np.zeros(19)}, "scores has 19 entries for 20 matches"),
         ({"scores": np.full(20, np.nan)}, "scores has NaN; give .* the lowest score"),
     ],

@@ -93,6 +93,14 @@ def test_no_contrast_exceeds_that_of_shared_neighbourhoods_even_with_duplicates(
     assert contrast.max() <= (1 / np.arange(1, 6)).sum() + 1e-12
 
 
+def test_copies_of_a_match_do_not_vouch_for_it():
+    """Features with two orientations give the same match twice, right or wrong."""
+    rng = np.random.default_rng(0)
+    X = rng.uniform(0, 1000, (200, 4))
+    X[100:] = X[:100]
+    assert density_contrast(X, 5).mean() < 0.1
+
+
 def test_all_matches_equal_is_no_error():
     for n in (2, 5, 40):
         contrast = density_contrast(np.ones((n, 4)))
