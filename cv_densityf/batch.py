@@ -1,0 +1,215 @@
+"""Many pairs at once: the same estimate for each, on all cores or on a cluster, through joblib."""
+
+from __future__ import annotations
+
+import sys
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence, Sized
+from concurrent.futures import BrokenExecutor
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cv_densityf._estimate import Estimate, estimate_fundamental
+
+Pair = Sequence[ArrayLike]
+
+
+def estimate_many(
+    pairs: Iterable[Pair],
+    *,
+    n_jobs: int | None = None,
+    backend: str | None = None,
+    progress: bool | None = None,
+    **options: Any,
+) -> Iterator[Estimate]:
+    """Estimate the fundamental matrix of every pair of images, in parallel.
+
+    Parameters
+    ----------
+    pairs : iterable of (points1, points2) or (points1, points2, scores)
+        What `estimate_fundamental` takes, pixels. Read as results are wanted, a little ahead, so a
+        generator that loads pairs keeps memory small.
+    n_jobs : int, optional
+        Pairs at a time; -1 for one per core. By default what `joblib.parallel_config` says, else 1.
+    backend : str, optional
+        joblib's: ``"loky"`` (processes), ``"threading"``, ``"dask"``, ``"ray"`` ... By default what
+        `joblib.parallel_config` says, else processes.
+    progress : bool, optional
+        Show a bar on standard error. By default if that is a terminal and tqdm is installed.
+    **options
+        Options of `estimate_fundamental` for all pairs.
+
+    Returns
+    -------
+    iterator of Estimate
+        In the order of ``pairs``. Each equals ``estimate_fundamental(*pair, **options)``, whatever
+        ``n_jobs`` and ``backend`` are. A pair that cannot be estimated, or whose worker process
+        died of it, gets a falsy `Estimate` whose ``reason`` says so; the others go on.
+
+    Raises
+    ------
+    TypeError, ValueError
+        At once, if an option is wrong. What ``pairs`` itself raises is raised where it occurs.
+
+    See Also
+    --------
+    estimate_fundamental : Does it for one pair.
+
+    Notes
+    -----
+    When a worker process dies (``"loky"``), the pairs that were unfinished then are estimated one
+    by one, each in a new process, which tells whose fault it was. ``"threading"`` and one job have
+    no worker to lose. On ``"dask"`` the scheduler gives the pairs of a dead worker to others; of a
+    pair that kills every worker it is given to, joblib 1.6 never hears again and waits.
+
+    Examples
+    --------
+    >>> from cv_densityf.batch import estimate_many
+    >>> from cv_densityf.datasets import two_view_scene
+    >>> scenes = [two_view_scene(300, random_state=seed) for seed in range(3)]
+    >>> pairs = [(scene.points1, scene.points2) for scene in scenes]
+    >>> [bool(estimate) for estimate in estimate_many(pairs, method="usac_magsac")]
+    [True, True, True]
+    """
+    if "scores" in options:
+        raise TypeError("scores belong to a pair: give (points1, points2, scores)")
+    # Checks the options now, not in each worker.
+    estimate_fundamental(np.empty((0, 2)), np.empty((0, 2)), **options)
+    total = len(pairs) if isinstance(pairs, Sized) else None
+    estimates = _estimates(iter(pairs), n_jobs, backend, options)
+    return _with_progress(estimates, total, progress)
+
+
+def _estimates(
+    pairs: Iterator[Pair], n_jobs: int | None, backend: str | None, options: dict[str, Any]
+) -> Iterator[Estimate]:
+    source = _Source(pairs)
+    while not source.empty:
+        try:
+            for estimate in _parallel(source, n_jobs, backend, options):
+                source.pending.popleft()
+                yield estimate
+        except BrokenExecutor:
+            # Any of the unfinished pairs may be the one to blame.
+            while source.pending:
+                yield _alone(source.pending.popleft(), options)
+        if source.error is not None:
+            raise source.error
+
+
+class _Source:
+    """The pairs, and which of them were handed out and not answered yet."""
+
+    def __init__(self, pairs: Iterator[Pair]) -> None:
+        self.pending: deque[Pair] = deque()
+        self.empty = False
+        self.error: Exception | None = None
+        self._pairs = pairs
+
+    def __iter__(self) -> Iterator[Pair]:
+        # joblib reads in its own threads, where an exception would be lost.
+        try:
+            for pair in self._pairs:
+                self.pending.append(pair)
+                yield pair
+        except Exception as error:
+            self.error = error
+        self.empty = True
+
+
+def _parallel(
+    pairs: Iterable[Pair], n_jobs: int | None, backend: str | None, options: dict[str, Any]
+) -> Iterator[Estimate]:
+    from joblib import Parallel, delayed
+
+    run = Parallel(n_jobs=n_jobs, backend=backend, return_as="generator")
+    estimates: Iterator[Estimate] = run(delayed(_one)(pair, options) for pair in pairs)
+    return estimates
+
+
+def _one(pair: Pair, options: dict[str, Any]) -> Estimate:
+    """Estimate one pair; whatever goes wrong is its own result."""
+    try:
+        points1, points2, *scores = pair
+        if len(scores) > 1:
+            raise ValueError(
+                f"a pair is (points1, points2) or (points1, points2, scores), not {len(pair)} items"
+            )
+        return estimate_fundamental(
+            points1, points2, scores=scores[0] if scores else None, **options
+        )
+    except Exception as error:
+        return _failure(pair, f"{type(error).__name__}: {error}")
+
+
+def _alone(pair: Pair, options: dict[str, Any]) -> Estimate:
+    """Estimate one pair in a process of its own, on this machine."""
+    try:
+        # One job would not leave this process.
+        (estimate,) = _parallel([pair], 2, "loky", options)
+    except BrokenExecutor as error:
+        return _failure(
+            pair,
+            f"the worker process died of it ({type(error).__name__}): out of memory, or a crash "
+            "in compiled code",
+        )
+    return estimate
+
+
+def _failure(pair: Pair, reason: str) -> Estimate:
+    try:
+        n = len(pair[0])  # type: ignore[arg-type]
+    except Exception:
+        n = 0
+    nothing = np.zeros(n, dtype=bool)
+    return Estimate(
+        F=None,
+        mask=nothing,
+        kept=nothing,
+        reliability=np.full(n, np.nan),
+        n_draws=0,
+        engine="none",
+        reason=reason,
+    )
+
+
+def _with_progress(
+    estimates: Iterator[Estimate], total: int | None, progress: bool | None
+) -> Iterator[Estimate]:
+    with progress_bar(total, progress) as update:
+        for estimate in estimates:
+            update()
+            yield estimate
+
+
+@contextmanager
+def progress_bar(total: int | None, shown: bool | None = None) -> Iterator[Any]:
+    """Give a function that moves a bar of pairs by some; does nothing where tqdm is missing.
+
+    Parameters
+    ----------
+    total : int, optional
+        Number of pairs, if known.
+    shown : bool, optional
+        By default if standard error is a terminal.
+
+    Yields
+    ------
+    callable
+        ``update(n=1)``.
+    """
+    if shown is None:
+        shown = sys.stderr is not None and sys.stderr.isatty()
+    if shown:
+        try:
+            from tqdm import tqdm
+        except ImportError:
+            shown = False
+    if not shown:
+        yield lambda n=1: None
+        return
+    with tqdm(total=total, unit="pair", file=sys.stderr) as bar:
+        yield bar.update
