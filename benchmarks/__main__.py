@@ -1,4 +1,4 @@
-"""``python -m benchmarks real | synthetic | stages | paper``."""
+"""``python -m benchmarks real | synthetic | stages | scale | paper``."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from benchmarks.data import Pair, load_pairs
 from benchmarks.paper import reproduce
 from benchmarks.peers import METHODS, Method, Settings, choose
 from benchmarks.run import Record, measure, one_thread, warm_up
+from benchmarks.scale import scale
 from benchmarks.scenes import KINDS, make_scene, scenes
 
 
@@ -81,6 +82,18 @@ def _parser() -> argparse.ArgumentParser:
     stages.add_argument("--method", default="usac_accurate")
     stages.add_argument("--repeats", type=int, default=10, metavar="N")
     stages.set_defaults(run=_stages)
+
+    growth = commands.add_parser("scale", help="time, accuracy and memory over N, and exponents")
+    growth.add_argument(
+        "--n", nargs="*", type=int, default=[1_000, 3_000, 10_000, 30_000, 100_000], metavar="N"
+    )
+    growth.add_argument(
+        "--cluster-n", nargs="*", type=int, default=[1_000, 2_000, 4_000, 20_000], metavar="N"
+    )
+    growth.add_argument("--scene", choices=KINDS, default="clusters")
+    growth.add_argument("--scenes", type=int, default=5, metavar="N", help="per size (default 5)")
+    growth.add_argument("--plot", metavar="FILE", help="draw time over N, both logarithmic")
+    growth.set_defaults(run=_scale)
 
     paper = commands.add_parser("paper", help="the tables and figures of Wu and Wan")
     paper.add_argument("--quick", action="store_true", help="two pairs, nothing rendered")
@@ -175,6 +188,11 @@ def _stages(args: argparse.Namespace) -> int:
     for stage, by_n in times.items():
         print(f"| {stage} | {' | '.join(_median(by_n[n], '.2f') for n in args.n)} |")
     print(f"| number of draws | {' | '.join(_median(draws[n], '.0f') for n in args.n)} |")
+    return 0
+
+
+def _scale(args: argparse.Namespace) -> int:
+    print(scale(args.n, args.cluster_n, args.scenes, args.scene, args.plot))
     return 0
 
 

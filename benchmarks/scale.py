@@ -1,0 +1,325 @@
+"""How time, accuracy and memory grow with the number of matches, ours beside cv2 and others."""
+
+from __future__ import annotations
+
+import multiprocessing
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+from benchmarks.data import Pair
+from benchmarks.peers import METHODS, Settings, choose
+from benchmarks.run import one_thread, warm_up
+from benchmarks.scenes import make_scene
+from cv_densityf import _estimate
+from cv_densityf._density import density_peaks
+from cv_densityf._prefilter import contrast_support
+
+Floats = NDArray[np.float64]
+
+RIVAL = "cv2:USAC_MAGSAC"
+CALLS = ("cv2:FM_RANSAC", RIVAL, "ours:FM_RANSAC", "ours:USAC_MAGSAC", "ours:USAC_ACCURATE")
+SEARCH_ALL = "ours:USAC_MAGSAC, searching all"
+FILTER = "contrast, reliability, kept"
+MATRIX = "density peaks, distance matrix"
+#: Exponents are fitted to the sizes between these.
+FIT = (1_000, 100_000)
+#: A search on all matches is compared up to here.
+MAX_SEARCH_ALL = 100_000
+#: The matrix version of density peaks is run up to here, and extrapolated like n^2.
+MAX_MATRIX = 4_000
+INLIER_RATIO, NOISE = 0.3, 0.5
+
+
+@dataclass
+class Series:
+    """What was measured of one function: for each number of matches, over the scenes.
+
+    Attributes
+    ----------
+    ms : dict of int to list of float
+        Processor time, the faster of two calls.
+    errors : dict of int to list of float
+        Pixels; empty for what gives no fundamental matrix.
+    """
+
+    ms: dict[int, list[float]] = field(default_factory=dict)
+    errors: dict[int, list[float]] = field(default_factory=dict)
+
+    def time(self, n: int) -> float:
+        """Median time, ms; NaN if not run."""
+        return float(np.median(self.ms[n])) if n in self.ms else np.nan
+
+    def error(self, n: int) -> float:
+        """Median error, pixels; NaN if there is none."""
+        return float(np.median(self.errors[n])) if self.errors.get(n) else np.nan
+
+    @property
+    def exponent(self) -> float:
+        """Slope of log time over log n, by least squares, between the sizes of `FIT`."""
+        n = np.array([n for n in self.ms if FIT[0] <= n <= FIT[1]])
+        if len(n) < 2:
+            return np.nan
+        return float(np.polyfit(np.log(n), np.log([self.time(k) for k in n]), 1)[0])
+
+
+def scale(
+    numbers: Sequence[int],
+    cluster_numbers: Sequence[int],
+    scenes: int,
+    kind: str = "clusters",
+    plot: str | None = None,
+) -> str:
+    """Measure, and return the tables as markdown.
+
+    Parameters
+    ----------
+    numbers : sequence of int
+        Numbers of matches for the calls and the filter.
+    cluster_numbers : sequence of int
+        Numbers of matches for clustering.
+    scenes : int
+        Scenes per number of matches; one above the largest size of `FIT`.
+    kind : str
+        Of the scenes, see `benchmarks.scenes.KINDS`.
+    plot : str, optional
+        File for the log-log plot.
+    """
+    if min([*numbers, *cluster_numbers], default=2) < 2 or scenes < 1:
+        raise ValueError("numbers of matches start at 2, scenes at 1")
+    with one_thread():
+        calls = measure_calls(numbers, scenes, kind)
+        clustering = measure_clustering(cluster_numbers, scenes, kind)
+    parts = [
+        f"Scenes `{kind}`, {INLIER_RATIO:.0%} inliers, noise {NOISE:g} px, threshold 1 px, "
+        f"{scenes} scenes per size; medians of processor time on one thread."
+    ]
+    if numbers:
+        largest = max((n for n in numbers if n <= FIT[1]), default=max(numbers))
+        memory = {n: measure_memory(n, kind) for n in sorted({largest, max(numbers)})}
+        parts += [
+            "## Time, ms\n\n" + _times(calls, numbers),
+            f"## Time / {RIVAL}\n\n" + _ratios(calls, numbers),
+            "## Error, px\n\n" + _errors(calls, numbers),
+            "## Peak memory over the input, MB\n\n" + _memory(memory),
+        ]
+    if cluster_numbers:
+        parts.append("## Clustering, ms\n\n" + _times(clustering, cluster_numbers))
+    if plot:
+        draw(plot, calls, clustering)
+    return "\n\n".join(parts) + "\n"
+
+
+def measure_calls(numbers: Sequence[int], scenes: int, kind: str) -> dict[str, Series]:
+    """Time the whole call of each method, and the filter alone on all matches."""
+    methods, _ = choose(list(CALLS))
+    estimators = {m.name: partial(m.estimate, s=Settings()) for m in methods}
+    series = {name: Series() for name in (*estimators, SEARCH_ALL, FILTER)}
+    warm_up(methods, Settings())
+    for n in numbers:
+        for pair in _scenes(kind, n, scenes):
+            for name, estimate in estimators.items():
+                _add(series[name], pair, estimate)
+            if _estimate.MAX_SEARCHED < n <= MAX_SEARCH_ALL:
+                with patch.object(_estimate, "MAX_SEARCHED", n):
+                    _add(series[SEARCH_ALL], pair, estimators["ours:USAC_MAGSAC"])
+            _add(series[FILTER], pair, lambda pair: contrast_support(pair.X), has_error=False)
+    return series
+
+
+def measure_clustering(numbers: Sequence[int], scenes: int, kind: str) -> dict[str, Series]:
+    """Time density peaks beside other ways to cluster matches."""
+    from sklearn.cluster import HDBSCAN
+
+    functions: dict[str, Callable[[Pair], object]] = {
+        "density_peaks": lambda pair: density_peaks(pair.X),
+        MATRIX: lambda pair: matrix_density_peaks(pair.X),
+        "sklearn HDBSCAN": lambda pair: HDBSCAN(min_cluster_size=10, copy=True).fit(pair.X),
+    }
+    if find_spec("pydpc") is not None:
+        from pydpc import Cluster
+
+        functions["pydpc"] = lambda pair: Cluster(pair.X, autoplot=False)
+    series = {name: Series() for name in functions}
+    for n in numbers:
+        for pair in _scenes(kind, n, scenes):
+            for name, function in functions.items():
+                # Others that keep all distances meet the memory's end as well.
+                if n <= MAX_MATRIX or name in ("density_peaks", "sklearn HDBSCAN"):
+                    _add(series[name], pair, function, has_error=False)
+    return series
+
+
+def matrix_density_peaks(X: Floats) -> tuple[Floats, Floats]:
+    """Return rho and delta in the obvious way, from the matrix of all distances."""
+    D = cdist(X, X)
+    n = len(X)
+    dc = np.partition(D.ravel(), n + int(0.02 * n * n))[n + int(0.02 * n * n)]
+    rho = np.less(D, dc).sum(axis=1) - 1.0
+    order = np.argsort(-rho, kind="stable")
+    ordered = D[np.ix_(order, order)]
+    largest = ordered[0].max()
+    ordered[np.triu_indices(n)] = np.inf
+    delta = np.empty(n)
+    delta[order] = ordered.min(axis=1)
+    delta[order[0]] = largest
+    return rho, delta
+
+
+def _scenes(kind: str, n: int, scenes: int) -> Iterable[Pair]:
+    for seed in range(scenes if n <= FIT[1] else 1):
+        yield make_scene(kind, n, INLIER_RATIO, NOISE, seed)
+
+
+def _add(series: Series, pair: Pair, call: Callable[[Pair], Any], has_error: bool = True) -> None:
+    n = len(pair.X)
+    times = []
+    for _ in range(2):
+        start = time.process_time()
+        result = call(pair)
+        times.append(1e3 * (time.process_time() - start))
+    series.ms.setdefault(n, []).append(min(times))
+    if has_error:
+        series.errors.setdefault(n, []).append(pair.error(result))
+
+
+def measure_memory(n: int, kind: str) -> dict[str, float]:
+    """Peak memory of each call over the process with its input, MB; NaN where unknown."""
+    pair = make_scene(kind, n, INLIER_RATIO, NOISE, 0)
+    context = multiprocessing.get_context("spawn")
+    peaks = {}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "X.npy"
+        np.save(path, pair.X)
+        for name in (*CALLS, "density_peaks"):
+            if name == "density_peaks" and n > FIT[1]:
+                continue
+            # A process of its own: memory that was freed before would hide a peak.
+            with context.Pool(1) as pool:
+                peaks[name] = pool.apply(_peak, (name, str(path)))
+    return peaks
+
+
+def _peak(name: str, path: str) -> float:
+    def call(X: Floats) -> None:
+        if name == "density_peaks":
+            density_peaks(X)
+            return
+        pair = Pair(
+            name="", group="", X=X, scores=None, truth=X, size1=(0, 0), size2=(0, 0),
+            cameras=None, F_gt=None,
+        )  # fmt: skip
+        METHODS[name].estimate(pair, Settings())
+
+    call(make_scene("clusters", 200, 0.5, 0.5).X)
+    X = np.load(path)
+    try:
+        Path("/proc/self/clear_refs").write_text("5")
+        before = _status("VmRSS")
+        call(X)
+        return (_status("VmHWM") - before) / 1024
+    except OSError:
+        return float("nan")
+
+
+def _status(name: str) -> int:
+    """Memory of this process as Linux has it, KiB."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith(name)).split()[1])
+
+
+def _table(header: Sequence[str], body: Iterable[Sequence[str]]) -> str:
+    lines = [header, ["---"] + ["--:"] * (len(header) - 1), *body]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _cell(value: float, form: str) -> str:
+    return "" if np.isnan(value) else format(value, form)
+
+
+def _times(series: Mapping[str, Series], numbers: Sequence[int]) -> str:
+    header = ["", *(f"N = {n:,}" for n in numbers), "exponent"]
+    body = []
+    for name, s in series.items():
+        cells = [_cell(s.time(n), ".1f") for n in numbers]
+        if name == MATRIX and s.ms:
+            last = max(s.ms)
+            cells = [
+                cell or f"({s.time(last) * (n / last) ** 2:.0f})"
+                for n, cell in zip(numbers, cells, strict=True)
+            ]
+        body.append([name, *cells, _cell(s.exponent, ".2f")])
+    return _table(header, body)
+
+
+def _ratios(series: Mapping[str, Series], numbers: Sequence[int]) -> str:
+    rival = series[RIVAL]
+    body = (
+        [name, *(_cell(s.time(n) / rival.time(n), ".2f") for n in numbers)]
+        for name, s in series.items()
+    )
+    return _table(["", *(f"N = {n:,}" for n in numbers)], body)
+
+
+def _errors(series: Mapping[str, Series], numbers: Sequence[int]) -> str:
+    body = (
+        [name, *(_cell(s.error(n), ".3f") for n in numbers)]
+        for name, s in series.items()
+        if s.errors
+    )
+    return _table(["median over the scenes", *(f"N = {n:,}" for n in numbers)], body)
+
+
+def _memory(memory: Mapping[int, Mapping[str, float]]) -> str:
+    names = list(dict.fromkeys(name for peaks in memory.values() for name in peaks))
+    body = (
+        [name, *(_cell(peaks.get(name, np.nan), ".0f") for peaks in memory.values())]
+        for name in names
+    )
+    return _table(["", *(f"N = {n:,}" for n in memory)], body)
+
+
+def draw(path: str, calls: Mapping[str, Series], clustering: Mapping[str, Series]) -> None:
+    """Draw time over the number of matches, both logarithmic."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    panels = [
+        (title, series)
+        for title, series in (("estimating F", calls), ("clustering", clustering))
+        if any(s.ms for s in series.values())
+    ]
+    for ax, (title, series) in zip(
+        np.atleast_1d(figure.subplots(1, len(panels))), panels, strict=True
+    ):
+        for name, s in series.items():
+            if not s.ms:
+                continue
+            n = sorted(s.ms)
+            ours = name.startswith(("ours", "density_peaks", FILTER))
+            label = name if np.isnan(s.exponent) else f"{name} ({s.exponent:.2f})"
+            ax.loglog(
+                n,
+                [s.time(k) for k in n],
+                "o-" if ours else "s--",
+                lw=2 if ours else 1.3,
+                ms=4,
+                label=label,
+            )
+        ax.set_title(f"{title} (exponent)")
+        ax.set_xlabel("matches")
+        ax.set_ylabel("time, ms")
+        ax.grid(color="0.9", which="both")
+        ax.set_axisbelow(True)
+        ax.legend(fontsize=7.5, frameon=False)
+    figure.savefig(path, dpi=130)
