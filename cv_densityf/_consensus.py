@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cv_densityf._engine import draw
-from cv_densityf._epipolar import Frame, eight_point, point_line_squared, polish
+from cv_densityf._epipolar import Frame, eight_point, point_line_squared, polish, shift
 from cv_densityf._stopwatch import Stopwatch
 
 Floats = NDArray[np.floating]
@@ -21,7 +21,7 @@ NEAR = 0.0
 ROUNDS = ((0.25, 0.5), (0.75, NEAR), (0.125, 1.0), (0.5, NEAR), (0.25, 1.0))
 _NEAR_WIDTH = 8.0
 #: Matches a draw gets at least: fewer crowd on too little of the image to fix F.
-MIN_DRAW = 40
+MIN_DRAW = 30
 #: cv2's iterations in one draw from a quarter of the matches, and less from larger, less pure
 #: parts. More find no better F; several short draws do.
 MAX_DRAW_ITERS = 1000
@@ -95,6 +95,9 @@ def search(
         None if no draw found a fundamental matrix.
     """
     n = len(X)
+    # Far from the origin the float32 that cv2 draws with would eat the pixels.
+    centre = X.mean(axis=0)
+    X = X - centre
     order = np.argsort(-reliability, kind="stable")
     points = X[order].astype(np.float32)
     reliable = order[: max(MIN_DRAW, n // 2)]
@@ -127,9 +130,11 @@ def search(
     if len(pool) == 0:
         return None
     F = pool.refined_best(reliable)
+    F = shift(-centre[2:]).T @ F @ shift(-centre[:2])
     watch.lap("polish")
-    outcome = f"two of {n_draws} draws agree" if pool.agrees() else f"best vote of {n_draws} draws"
-    return Consensus(F=F, votes=tuple(pool.votes.tolist()), n_draws=n_draws, reason=outcome)
+    again = ", found again by another" if pool.agrees() else ""
+    reason = f"the hypothesis with the most votes of {n_draws} draws{again}"
+    return Consensus(F=F, votes=tuple(pool.votes.tolist()), n_draws=n_draws, reason=reason)
 
 
 class _Pool:
@@ -170,9 +175,9 @@ class _Pool:
         scale = _SIGMAS * _noise(self._squared[self.best, reliable], self.threshold)
         if scale < self.threshold:
             self.working = max(scale, _SMALLEST_SCALE * self.threshold)
-            G, self._G = self._G, self._G[:0]
-            self._squared, self.votes = self._squared[:0], self.votes[:0]
-            self.add(self._frame.leave(G))
+            F = self._frame.leave(self._G)
+            self._G, self._squared, self.votes = self._G[:0], self._squared[:0], self.votes[:0]
+            self.add(F)
 
     def near_best(self, width: float) -> Bools:
         """Mark the matches within ``width`` working thresholds of the best hypothesis."""
@@ -194,7 +199,7 @@ class _Pool:
             width = _REFINE_SIGMAS * _noise(squared[reliable], self.threshold)
             G = polish(self._frame, G, [max(width, _NARROWEST * self.threshold)])
             squared = self._frame.sampson(G)[0]
-        return np.ascontiguousarray(self._frame.leave(G)[0])
+        return np.asarray(self._frame.leave(G)[0])
 
 
 def _noise(squared: Floats, threshold: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 import cv2
@@ -52,7 +53,7 @@ def method_flag(method: str | int) -> int:
         name = method.lower().removeprefix("fm_")
         if name in METHODS:
             return METHODS[name]
-    elif int(method) in METHODS.values():
+    elif isinstance(method, Integral) and method in METHODS.values():
         return int(method)
     raise ValueError(f"unknown method {method!r}; choose one of {', '.join(METHODS)}")
 

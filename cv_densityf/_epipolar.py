@@ -120,8 +120,9 @@ class Frame:
         for i in range(9):
             np.multiply(self.products[i], self.products[i:], out=self.outer[row : row + 9 - i])
             row += 9 - i
-        self._first = _centring(centre[:2], self.scale)
-        self._second = _centring(centre[2:], self.scale)
+        zoom = np.diag([self.scale, self.scale, 1.0])
+        self._first = zoom @ shift(-centre[:2])
+        self._second = zoom @ shift(-centre[2:])
 
     def enter(self, F: Floats) -> Floats:
         """Fundamental matrices (m, 3, 3) in pixels, in this frame and of unit norm."""
@@ -146,10 +147,9 @@ class Frame:
         return algebraic * algebraic / (norm * self.scale**2 + _TINY)
 
 
-def _centring(centre: Floats, scale: float) -> Floats:
-    return np.array(
-        [[scale, 0.0, -scale * centre[0]], [0.0, scale, -scale * centre[1]], [0.0, 0.0, 1.0]]
-    )
+def shift(by: Floats) -> NDArray[np.float64]:
+    """Matrix that moves homogeneous points by a vector (2,)."""
+    return np.array([[1.0, 0.0, by[0]], [0.0, 1.0, by[1]], [0.0, 0.0, 1.0]])
 
 
 _TINY = 1e-300

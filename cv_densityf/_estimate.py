@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from numbers import Integral
-from typing import Any, Literal
+from numbers import Integral, Real
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +17,7 @@ from cv_densityf._prefilter import contrast_support, paper_support
 from cv_densityf._stopwatch import Stopwatch
 
 Density = Literal["contrast", "paper", "off"]
+DENSITIES = get_args(Density)
 
 #: With fewer matches cv2 turns RANSAC into LMEDS, and there is no density to speak of.
 MIN_FILTERED = 15
@@ -94,7 +96,8 @@ def run(
     """Estimate F from trusted arguments: X (n, 4) float64, whose rows may hold NaN or Inf."""
     watch = Stopwatch()
     n = len(X)
-    finite = np.asarray(np.isfinite(X).all(axis=1))
+    with np.errstate(over="ignore"):
+        finite = np.asarray(np.isfinite(X.astype(np.float32)).all(axis=1))  # as cv2 sees them
     rows = np.flatnonzero(finite)
     if density == "off" or robust.flag in _DIRECT or len(rows) < MIN_FILTERED:
         why = "density is off" if density == "off" else f"{method_name(robust)} takes no filter"
@@ -269,14 +272,14 @@ def estimate_fundamental(
             raise ValueError(f"scores has {len(trust)} entries for {len(first)} matches")
         if np.isnan(trust).any():
             raise ValueError("scores has NaN; give matches of unknown trust the lowest score")
-    _check("threshold", threshold, threshold > 0 and np.isfinite(threshold), "finite, above 0")
-    _check("confidence", confidence, 0 < confidence < 1, "between 0 and 1, both excluded")
-    _check("max_iters", max_iters, max_iters >= 1, "at least 1")
-    _check("density", density, density in ("contrast", "paper", "off"), "contrast, paper or off")
-    _check("alpha", alpha, 0 <= alpha <= 1, "from 0 to 1")
-    _check("dc_percent", dc_percent, 0 < dc_percent <= 100, "above 0, at most 100")
-    is_seed = isinstance(random_state, Integral) and 0 <= random_state < 2**31
-    _check("random_state", random_state, is_seed, "an integer from 0 to 2^31 - 1")
+    _check("threshold", threshold, Real, lambda v: 0 < v < np.inf, "a finite number above 0")
+    _check("confidence", confidence, Real, lambda v: 0 < v < 1, "a number inside (0, 1)")
+    _check("max_iters", max_iters, Integral, lambda v: v >= 1, "an integer, at least 1")
+    _check("density", density, str, DENSITIES.__contains__, f"one of {', '.join(DENSITIES)}")
+    _check("alpha", alpha, Real, lambda v: 0 <= v <= 1, "a number from 0 to 1")
+    _check("dc_percent", dc_percent, Real, lambda v: 0 < v <= 100, "a number in (0, 100]")
+    in_range = range(2**31).__contains__
+    _check("random_state", random_state, Integral, in_range, "an integer from 0 to 2^31 - 1")
     return run(
         np.hstack([first, second]),
         Robust(method_flag(method), float(threshold), float(confidence), int(max_iters)),
@@ -297,6 +300,6 @@ def _points(points: ArrayLike, name: str) -> NDArray[np.float64]:
     return array
 
 
-def _check(name: str, value: object, holds: bool | np.bool_, wanted: str) -> None:
-    if not holds:
+def _check(name: str, value: Any, kind: type, holds: Callable[[Any], bool], wanted: str) -> None:
+    if not isinstance(value, kind) or not holds(value):
         raise ValueError(f"{name} is {value!r}; it must be {wanted}")

@@ -12,7 +12,7 @@ Floats = NDArray[np.floating]
 Bools = NDArray[np.bool_]
 
 #: Neighbours looked at around each match, in each image.
-N_NEIGHBORS = 10
+N_NEIGHBORS = 12
 #: Rows compared at a time, so that the comparison table stays in the cache.
 _CHUNK = 4096
 
@@ -24,8 +24,8 @@ def density_contrast(X: Floats, n_neighbors: int | None = None) -> NDArray[np.fl
     were paired at random, two neighbourhoods of k matches out of n would share k^2 / n; around a
     right match most neighbours are shared. Each shared neighbour counts 1 / rank, rank being its
     place (1, 2, ...) in the list where it stands later, which averages the density over all
-    neighbourhood sizes up to ``n_neighbors``. The count of shared neighbours is the one of
-    locality preserving matching (Ma et al., IJCV 2019).
+    neighbourhood sizes up to ``n_neighbors``. Copies of a match do not count. Locality preserving
+    matching (Ma et al., IJCV 2019) counts shared neighbours, too.
 
     Parameters
     ----------
@@ -49,7 +49,10 @@ def density_contrast(X: Floats, n_neighbors: int | None = None) -> NDArray[np.fl
         rows = slice(start, start + _CHUNK)
         shared = near1[rows, :, None] == near2[rows, None, :]
         row, rank1, rank2 = np.nonzero(shared)
-        contrast[rows] = np.bincount(row, weight[np.maximum(rank1, rank2)], minlength=len(shared))
+        # A copy of a match, such as SIFT's second orientation, says nothing for it.
+        other = (X[rows][row] != X[near1[rows][row, rank1]]).any(axis=1)
+        counts = weight[np.maximum(rank1, rank2)] * other
+        contrast[rows] = np.bincount(row, counts, minlength=len(shared))
     return contrast
 
 
@@ -63,11 +66,10 @@ def _neighbors(points: Floats, k: int) -> NDArray[np.intp]:
 
 
 def ranks(values: Floats) -> NDArray[np.float64]:
-    """Rank of each value, 0 for the smallest to 1 for the largest; ties in order of rows."""
-    n = len(values)
-    rank = np.empty(n)
-    rank[np.argsort(values, kind="stable")] = np.arange(n) / max(n - 1, 1)
-    return rank
+    """Rank of each value, from 0 for the smallest to 1 for the largest; equal values share one."""
+    ordered = np.sort(values)
+    twice = ordered.searchsorted(values, "left") + ordered.searchsorted(values, "right") - 1
+    return twice / (2.0 * max(len(values) - 1, 1))
 
 
 def contrast_reliability(X: Floats) -> NDArray[np.float64]:
