@@ -7,7 +7,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from benchmarks.data import Pair
-from benchmarks.peers import METHODS, Settings, choose
+from benchmarks.peers import METHODS, Method, Settings, choose
 from benchmarks.run import one_thread, warm_up
 from benchmarks.scenes import make_scene
 from cv_densityf import _estimate
@@ -123,7 +122,7 @@ def scale(
 def measure_calls(numbers: Sequence[int], scenes: int, kind: str) -> dict[str, Series]:
     """Time the whole call of each method, and the filter alone on all matches."""
     methods, _ = choose(list(CALLS))
-    estimators = {m.name: partial(m.estimate, s=Settings()) for m in methods}
+    estimators = {m.name: _with_defaults(m) for m in methods}
     series = {name: Series() for name in (*estimators, SEARCH_ALL, FILTER)}
     warm_up(methods, Settings())
     for n in numbers:
@@ -135,6 +134,10 @@ def measure_calls(numbers: Sequence[int], scenes: int, kind: str) -> dict[str, S
                     _add(series[SEARCH_ALL], pair, estimators["ours:USAC_MAGSAC"])
             _add(series[FILTER], pair, lambda pair: contrast_support(pair.X), has_error=False)
     return series
+
+
+def _with_defaults(method: Method) -> Callable[[Pair], Any]:
+    return lambda pair: method.estimate(pair, Settings())
 
 
 def measure_clustering(numbers: Sequence[int], scenes: int, kind: str) -> dict[str, Series]:
