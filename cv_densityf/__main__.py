@@ -20,10 +20,11 @@ from numpy.typing import NDArray
 
 import cv_densityf
 from cv_densityf._density import density_peaks
-from cv_densityf._engine import METHODS, Robust, method_flag
+from cv_densityf._engine import GRAPH_CUT_MAX, METHODS, Robust, method_flag
 from cv_densityf._epipolar import Floats, residuals
 from cv_densityf._estimate import Estimate, estimate_fundamental
 from cv_densityf._files import InputError, read_matches, replacing
+from cv_densityf._run_script import add_run, run_script
 from cv_densityf.matching import (
     MAX_FEATURES,
     MAX_SIZE,
@@ -37,8 +38,6 @@ FOUND, NOT_FOUND, WRONG_USE = 0, 1, 2
 _MIN_MATCHES = 8
 #: More points than this make a decision graph neither clearer nor quickly.
 _MAX_GRAPH_POINTS = 10_000
-#: From about 50,000 points on cv2's own USAC_ACCURATE can end the process (OpenCV 5.0).
-_MAX_PLAIN_ACCURATE = 40_000
 _DEMO_ORDERS = 10
 
 
@@ -55,8 +54,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         Exit code: 0 found, 1 no fundamental matrix found, 2 wrong use.
     """
+    options = _parser().parse_args(arguments)
+    if options.run == run_script:
+        # Outside of the handlers: what the program raises is not ours to explain.
+        return run_script(options)
     try:
-        options = _parser().parse_args(arguments)
         code: int = options.run(options)
         sys.stdout.flush()
         return code
@@ -94,6 +96,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(metavar="COMMAND", required=True)
     _add_match(commands)
     _add_demo(commands)
+    add_run(commands)
     version = commands.add_parser("version", help="print versions, for a bug report")
     version.set_defaults(run=_run_version)
     return parser
@@ -297,7 +300,7 @@ def _run_match(options: argparse.Namespace) -> int:
             random_state=options.seed,
         )
     plain = None
-    if options.method != "usac_accurate" or len(X) <= _MAX_PLAIN_ACCURATE:
+    if options.method != "usac_accurate" or len(X) <= GRAPH_CUT_MAX:
         with _stage("plain cv2", timings):
             plain = robust.plain(X[:, :2], X[:, 2:])
     report = {
