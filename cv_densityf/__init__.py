@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 from cv_densityf._density import DensityPeaksResult, density_peaks
 from cv_densityf._estimate import Estimate, estimate_fundamental
+from cv_densityf._zhang import epipolar_distance
 from cv_densityf.cv2_api import findFundamentalMat
 
 if TYPE_CHECKING:
+    from cv_densityf.batch import estimate_many
     from cv_densityf.estimators import (
         DecisionGraphDisplay,
         DensityPeaks,
@@ -28,6 +30,7 @@ _LAZY = {
     "DensityPeaksFilter": "estimators",
     "FundamentalMatrixEstimator": "estimators",
     "Matches": "matching",
+    "estimate_many": "batch",
     "is_patched": "patching",
     "match_images": "matching",
     "patch_cv2": "patching",
@@ -45,7 +48,9 @@ __all__ = [
     "FundamentalMatrixEstimator",
     "Matches",
     "density_peaks",
+    "epipolar_distance",
     "estimate_fundamental",
+    "estimate_many",
     "findFundamentalMat",
     "is_patched",
     "match_images",

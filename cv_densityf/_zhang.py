@@ -60,7 +60,7 @@ def epipolar_distance(
     Examples
     --------
     >>> import numpy as np
-    >>> from cv_densityf._zhang import epipolar_distance
+    >>> from cv_densityf import epipolar_distance
     >>> rows_match = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]])
     >>> two_rows_lower = np.array([[0, 0, 0], [0, 0, -1], [0, 1, -2]])
     >>> round(epipolar_distance(rows_match, two_rows_lower, (640, 480), (640, 480)), 6)
