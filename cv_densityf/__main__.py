@@ -97,6 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_match(commands)
     _add_demo(commands)
     add_run(commands)
+    _add_verify(commands)
     version = commands.add_parser("version", help="print versions, for a bug report")
     version.set_defaults(run=_run_version)
     return parser
@@ -226,6 +227,45 @@ def _add_demo(commands: argparse._SubParsersAction[Any]) -> None:
         "--out", type=Path, default=Path("cv-densityf-demo"), metavar="DIR", help="(%(default)s)"
     )
     demo.set_defaults(run=_run_demo)
+
+
+def _add_verify(commands: argparse._SubParsersAction[Any]) -> None:
+    verify = commands.add_parser(
+        "verify",
+        help="verify the matches of a COLMAP database",
+        description="Estimate F for every matched image pair of a COLMAP database and write the "
+        "two-view geometries, in place of COLMAP's own geometric verification.",
+    )
+    verify.add_argument("database", metavar="DATABASE", help="with keypoints and matches")
+    verify.add_argument(
+        "--method",
+        choices=METHODS,
+        default="usac_accurate",
+        metavar="NAME",
+        help=f"cv2's method: {', '.join(METHODS)} (%(default)s)",
+    )
+    verify.add_argument(
+        "--threshold",
+        metavar="PX",
+        type=_POSITIVE,
+        default=4.0,
+        help="for inliers, pixels (%(default)s, as COLMAP)",
+    )
+    verify.add_argument(
+        "--min-inliers",
+        metavar="N",
+        type=_number(int, lambda v: 8 <= v < 2**31, "a whole number from 8"),
+        default=15,
+        help="a pair with fewer is degenerate (%(default)s, as COLMAP)",
+    )
+    verify.add_argument(
+        "--jobs", metavar="N", type=_POSITIVE_INT, default=-1, help="pairs at a time (all cores)"
+    )
+    verify.add_argument(
+        "--resume", action="store_true", help="leave pairs alone that are verified already"
+    )
+    verify.add_argument("--dry-run", action="store_true", help="estimate, and write nothing")
+    verify.set_defaults(run=_run_verify)
 
 
 @contextmanager
@@ -536,6 +576,31 @@ def _demo_estimators() -> Iterator[tuple[str, Callable[[Floats, Floats], tuple[A
             return F, 0 if mask is None else mask
 
         yield f"cv2, {name}", plain
+
+
+def _run_verify(options: argparse.Namespace) -> int:
+    from cv_densityf.colmap import verify_matches
+
+    done = verify_matches(
+        options.database,
+        method=options.method,
+        threshold=options.threshold,
+        min_inliers=options.min_inliers,
+        n_jobs=options.jobs,
+        resume=options.resume,
+        dry_run=options.dry_run,
+    )
+    now = done.n_pairs - done.n_before
+    before = f", {done.n_before} more were done before" if options.resume else ""
+    print(
+        f"{done.n_verified} of {now} image pairs verified{before}; "
+        f"{done.n_inliers} of {done.n_matches} matches are inliers"
+    )
+    if options.dry_run:
+        print("dry run: nothing was written")
+    for image_id1, image_id2, reason in done.failures:
+        _complain(f"images {image_id1} and {image_id2}: {reason}", NOT_FOUND)
+    return FOUND if done.n_verified or (done.n_before and not done.failures) else NOT_FOUND
 
 
 def _run_version(options: argparse.Namespace) -> int:
