@@ -131,8 +131,8 @@ def draw(
     params.sampler = cv2.SAMPLING_UNIFORM
     params.score = cv2.SCORE_METHOD_MSAC
     params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
-    params.loIterations = 10
-    params.loSampleSize = 12
+    params.loIterations = 5
+    params.loSampleSize = 20
     try:
         F, _ = original(points[:, :2], points[:, 2:], params)
     except cv2.error:
