@@ -72,7 +72,8 @@ def run_script(options: argparse.Namespace) -> int:
 
 
 def _run_module(name: str, *arguments: str) -> int:
-    _set_path(os.getcwd())
+    if not sys.flags.safe_path:
+        sys.path[0] = os.getcwd()
     sys.argv = ["-m", *arguments]  # the first one becomes the module's path
     _run_module_as_main(name)
     return 0
@@ -81,7 +82,9 @@ def _run_module(name: str, *arguments: str) -> int:
 def _run_path(main: ModuleType, script: str, *arguments: str) -> int:
     sys.argv = [script, *arguments]
     if pkgutil.get_importer(script) is not None:  # a folder or a zip file
-        sys.path[:1] = [script]
+        if not sys.flags.safe_path:
+            del sys.path[0]
+        sys.path.insert(0, os.path.abspath(script))
         _run_module_as_main("__main__", False)
         return 0
     path = os.path.abspath(script)
@@ -92,15 +95,11 @@ def _run_path(main: ModuleType, script: str, *arguments: str) -> int:
         reason = f"[Errno {error.errno}] {error.strerror}"
         print(f"cv-densityf: can't open file {path!r}: {reason}", file=sys.stderr)
         return CANNOT_OPEN
-    _set_path(os.path.dirname(os.path.realpath(path)))
+    if not sys.flags.safe_path:  # python -P and -I put nothing in front
+        sys.path[0] = os.path.dirname(os.path.realpath(path))
     vars(main).update(__file__=path, __cached__=None, __loader__=SourceFileLoader("__main__", path))
     exec(compile(source, path, "exec", dont_inherit=True), vars(main))
     return 0
-
-
-def _set_path(first: str) -> None:
-    if not sys.flags.safe_path:  # python -P and -I put nothing in front
-        sys.path[0] = first
 
 
 def _hide_our_frames(error: BaseException) -> None:
