@@ -145,7 +145,8 @@ def findFundamentalMat(
     points1, points2 : array_like of cv2, shapes (N, 2), (N, 1, 2), (1, N, 2), ... or cv2.UMat
         Matched points in pixels, row i of one with row i of the other. cv2 rounds them to float32.
         (N, 3) is homogeneous: divided by the classic methods, its third column ignored by USAC.
-        Rows with NaN or infinity are never inliers.
+        Rows with NaN or infinity are never inliers; but ``FM_8POINT`` is cv2's own answer, which is
+        a matrix of NaN and a mask of ones for a single row with NaN.
     method : int, default cv2.FM_RANSAC
         ``cv2.FM_RANSAC``, ``cv2.FM_LMEDS`` or one of ``cv2.USAC_*``; any other is cv2's own call.
     ransacReprojThreshold : float, default 3.0
@@ -204,7 +205,7 @@ def findFundamentalMat(
 
     References
     ----------
-    .. [1] Y. Wu and X. Wan, fundamental matrix estimation with density peaks of matches.
+    .. [1] H. Wu and Y. Wan, "Clustering assisted fundamental matrix estimation", 2015.
 
     Examples
     --------
