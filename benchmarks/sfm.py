@@ -32,6 +32,8 @@ Floats = NDArray[np.float64]
 N_VIEWS = 12
 #: Views spread over this angle around the scene, degrees.
 ARC = 100.0
+#: The corridor's walls would stand between the arc and the scene.
+ARC_SCENES = tuple(name for name in SCENES if name != "corridor")
 #: SIFT ratio below which COLMAP keeps a match: its default, and no ratio test.
 RATIOS = {"ratio 0.8": 0.8, "no ratio test": 1.0}
 
@@ -206,7 +208,7 @@ def similarity(source: Floats, target: Floats) -> tuple[float, Floats, Floats]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Print a table of every scene, with and without a ratio test."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.sfm", description=__doc__)
-    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
+    parser.add_argument("--scenes", nargs="+", choices=ARC_SCENES, default=ARC_SCENES)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args(argv)
     header = (

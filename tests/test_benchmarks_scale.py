@@ -1,0 +1,114 @@
+"""The measurements of scale measure what they say."""
+
+from __future__ import annotations
+
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from benchmarks import scale, sfm
+from benchmarks.__main__ import main
+from benchmarks.rendered import View
+from cv_densityf import density_peaks
+
+
+def test_exponents_of_known_powers():
+    series = scale.Series(ms={n: [3e-4 * n**1.5] for n in (1_000, 5_000, 100_000)})
+    assert series.exponent == pytest.approx(1.5)
+    # Beyond the fitted sizes anything goes.
+    series.ms |= {10: [1e9], 1_000_000: [1.0]}
+    assert series.exponent == pytest.approx(1.5)
+    assert np.isnan(scale.Series(ms={1_000: [1.0]}).exponent)
+
+
+def test_the_matrix_version_clusters_as_ours():
+    X = np.random.default_rng(0).normal(size=(400, 4))
+    rho, delta = scale.matrix_density_peaks(X)
+    peaks = density_peaks(X)
+    # The cut-off is an order statistic of all distances with ours, of the matrix with theirs.
+    assert np.corrcoef(rho, peaks.rho)[0, 1] > 0.99
+    top = np.argsort(-delta)[:5]
+    assert set(top) == set(np.argsort(-peaks.delta)[:5])
+
+
+def test_tables_hold_every_method_and_size(capsys, tmp_path, monkeypatch):
+    # Starts a process per method, which takes its time.
+    monkeypatch.setattr(scale, "measure_memory", lambda n, kind: {"density_peaks": 12.0})
+    plot = tmp_path / "scale.png"
+    numbers = ["--n", "1000", "--cluster-n", "300", "600", "--scenes", "1"]
+    assert main(["scale", *numbers, "--plot", str(plot)]) == 0
+    text = capsys.readouterr().out
+    times = text.split("## Time, ms")[1].split("##")[0]
+    for name in (*scale.CALLS, scale.FILTER):
+        (row,) = [line for line in times.splitlines() if line.startswith(f"| {name} |")]
+        assert float(row.split("|")[2]) > 0
+    (rival,) = [
+        line.split("|") for line in text.splitlines() if line.startswith(f"| {scale.RIVAL} | 1.00")
+    ]
+    assert len(rival) == 4
+    assert "| density_peaks |" in text.split("## Clustering")[1]
+    assert plot.stat().st_size > 10_000
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_peak_memory_sees_what_is_allocated_and_freed(tmp_path, monkeypatch):
+    path = tmp_path / "X.npy"
+    np.save(path, np.zeros((1000, 4)))
+
+    def hungry(X):
+        np.ones((len(X), 12_500)).sum()  # 100 MB for the 1,000 rows
+
+    monkeypatch.setattr(scale, "density_peaks", hungry)
+    assert scale._peak("density_peaks", str(path)) == pytest.approx(95.4, abs=8)
+
+
+def test_nothing_to_measure_is_refused(capsys):
+    assert main(["scale", "--n", "1"]) == 2
+    assert "start at 2" in capsys.readouterr().err
+
+
+class _Pose:
+    def __init__(self, R, t):
+        self.translation = t
+        self.rotation = self
+        self._R = R
+
+    def matrix(self):
+        return self._R
+
+
+class _Image:
+    def __init__(self, name, R, t):
+        self.name = name
+        self.cam_from_world = lambda: _Pose(R, t)
+
+
+class _Model:
+    def __init__(self, images):
+        self.images = dict(enumerate(images))
+
+
+def test_pose_errors_do_not_depend_on_the_world_but_on_the_poses():
+    rng = np.random.default_rng(1)
+    views = []
+    for _ in range(7):
+        R = cv2.Rodrigues(rng.normal(size=3))[0]
+        views.append(View(np.zeros(0, np.uint8), np.zeros(0), R, rng.normal(size=3)))
+    turn, scale_, shift = cv2.Rodrigues(rng.normal(size=3))[0], 2.5, rng.normal(size=3)
+
+    def image(i, extra=None):
+        # world' = scale * turn @ world + shift
+        R = (np.eye(3) if extra is None else extra) @ views[i].R @ turn.T
+        centre = scale_ * turn @ (-views[i].R.T @ views[i].t) + shift
+        return _Image(f"{i:02d}.png", R, -R @ centre)
+
+    exact = sfm.pose_errors(_Model([image(i) for i in range(7)]), views)
+    assert exact == pytest.approx((0, 0), abs=1e-4)
+    tilt = cv2.Rodrigues(np.deg2rad([0.0, 3.0, 0.0]))[0]
+    position, rotation = sfm.pose_errors(_Model([image(i, tilt) for i in range(7)]), views)
+    assert position == pytest.approx(0, abs=1e-4)
+    assert rotation == pytest.approx(3, abs=1e-4)
+    few = sfm.pose_errors(_Model([image(i) for i in range(3)]), views)
+    assert few == (np.inf, np.inf)
