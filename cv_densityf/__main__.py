@@ -179,7 +179,7 @@ def _add_match(commands: argparse._SubParsersAction[Any]) -> None:
         "--density",
         choices=("contrast", "paper", "off"),
         default="contrast",
-        help="how matches are chosen to draw from (%(default)s)",
+        help="how the dense matches are chosen (%(default)s)",
     )
     estimate.add_argument(
         "--alpha", metavar="A", type=_ALPHA, default=0.011, help="of --density paper (%(default)s)"
@@ -415,7 +415,7 @@ def _for_people(report: dict[str, Any]) -> str:
     plain = ["-", "not run", "-", "-"]
     if report["cv2"] is not None:
         plain = [report["n_matches"], *_result(report["cv2"]), f"{times['plain cv2']:.1f}"]
-    names = ["kept to draw from", "inliers", "median residual, px", "time, ms"]
+    names = ["kept as dense", "inliers", "median residual, px", "time, ms"]
     lines = [
         f"{report['n_matches']} matches, {report['method']}, threshold {report['threshold']:g} px",
         "",
@@ -478,7 +478,8 @@ def _draw(
 ) -> None:
     from cv_densityf import plotting
 
-    rows = np.flatnonzero(np.isfinite(X).all(axis=1))
+    with np.errstate(over="ignore"):
+        rows = np.flatnonzero(np.isfinite(X.astype(np.float32)).all(axis=1))  # as cv2 sees them
     rows = rows[:: max(1, -(-len(rows) // _MAX_GRAPH_POINTS))]
     figure = plotting.summary_figure(
         *images,

@@ -68,6 +68,7 @@ def search(
     max_iters: int,
     seed: int,
     watch: Stopwatch,
+    scores: Floats | None = None,
 ) -> Consensus | None:
     """Search for the fundamental matrix that the reliable and well spread matches vote for.
 
@@ -88,6 +89,9 @@ def search(
         Where the draws' random numbers start.
     watch : Stopwatch
         Is charged with the time of draws, polish and vote.
+    scores : array, shape (n,), optional
+        The caller's trust in each match: one more draw takes its samples in this order, whatever
+        the density says.
 
     Returns
     -------
@@ -103,8 +107,14 @@ def search(
     reliable = order[: max(MIN_DRAW, n // 2)]
     pool = _Pool(X, reliability, threshold)
     n_draws = 0
+    found = []
+    if scores is not None:
+        ranked = X[np.argsort(-scores, kind="stable")].astype(np.float32)
+        F = draw(ranked, threshold, confidence, max_iters, seed, best_first=True)
+        n_draws = 1
+        if F is not None:
+            found.append(F)
     for fractions in ROUNDS:
-        found = []
         for fraction in fractions:
             if fraction != NEAR:
                 part = points[: max(MIN_DRAW, int(n * fraction))]
@@ -124,6 +134,7 @@ def search(
             pool.add(np.stack(found))
             if first:
                 pool.adapt(reliable)
+            found = []
         watch.lap("polish")
         if pool.agrees():
             break
@@ -194,12 +205,22 @@ class _Pool:
 
     def refined_best(self, reliable: Ints) -> NDArray[np.float64]:
         """Polish the best hypothesis at the width of its own residuals; in pixels, (3, 3)."""
-        G, squared = self._G[self.best : self.best + 1], self._squared[self.best]
-        for _ in range(_REFINE_STEPS):
-            width = _REFINE_SIGMAS * _noise(squared[reliable], self.threshold)
-            G = polish(self._frame, G, [max(width, _NARROWEST * self.threshold)])
-            squared = self._frame.sampson(G)[0]
-        return np.asarray(self._frame.leave(G)[0])
+        best = self._G[self.best]
+        return _refined(self._frame, best, reliable, self.threshold)
+
+
+def refine(F: Floats, X: Floats, reliable: Ints, threshold: float) -> NDArray[np.float64]:
+    """Polish F (3, 3) on the matches X (n, 4) at the noise of the rows in ``reliable``."""
+    frame = Frame(X)
+    return _refined(frame, frame.enter(F[None])[0], reliable, threshold)
+
+
+def _refined(frame: Frame, G: Floats, reliable: Ints, threshold: float) -> NDArray[np.float64]:
+    G = G[None]
+    for _ in range(_REFINE_STEPS):
+        width = _REFINE_SIGMAS * _noise(frame.sampson(G)[0, reliable], threshold)
+        G = polish(frame, G, [max(width, _NARROWEST * threshold)])
+    return np.ascontiguousarray(frame.leave(G)[0])
 
 
 def _noise(squared: Floats, threshold: float) -> float:
@@ -291,8 +312,7 @@ def eight_point_ransac(
     needed: float = max_iters
     while drawn < needed:
         size = min(_BATCH, max_iters - drawn)
-        samples = rng.random((size, n)).argpartition(7, axis=1)[:, :8]
-        F = eight_point(X[samples])
+        F = eight_point(X[_samples(rng, n, size)])
         counts = np.count_nonzero(point_line_squared(F, X) <= threshold * threshold, axis=1)
         for candidate, inliers in zip(F, counts.tolist(), strict=True):
             drawn += 1
@@ -311,3 +331,16 @@ def _samples_needed(inlier_ratio: float, confidence: float) -> float:
     """Count the samples of eight until one is clean with the given confidence; at least one."""
     clean = min(inlier_ratio**8, 1.0 - 1e-12)
     return max(1.0, float(np.log1p(-confidence) / np.log1p(-clean)))
+
+
+def _samples(rng: np.random.Generator, n: int, size: int) -> Ints:
+    """Draw sets of eight different rows, (size, 8)."""
+    if n < 64:
+        return rng.random((size, n)).argpartition(7, axis=1)[:, :8]
+    samples = rng.integers(n, size=(size, 8))
+    while True:
+        ordered = np.sort(samples, axis=1)
+        repeated = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
+        if not repeated.any():
+            return samples
+        samples[repeated] = rng.integers(n, size=(int(repeated.sum()), 8))

@@ -88,6 +88,13 @@ class Robust:
             return "usac"
         return "ransac" if self.flag & ~3 == cv2.FM_RANSAC else "lmeds"
 
+    @property
+    def best_first(self) -> bool:
+        """Whether the method takes the order of the rows for their quality."""
+        if self.params is not None:
+            return bool(self.params.sampler == cv2.SAMPLING_PROSAC)
+        return self.flag == cv2.USAC_PROSAC
+
     def plain(
         self, points1: Any, points2: Any
     ) -> tuple[NDArray[np.float64] | None, NDArray[np.uint8] | None]:
@@ -114,9 +121,16 @@ class Robust:
 
 
 def draw(
-    points: NDArray[np.float32], threshold: float, confidence: float, max_iters: int, seed: int
+    points: NDArray[np.float32],
+    threshold: float,
+    confidence: float,
+    max_iters: int,
+    seed: int,
+    best_first: bool = False,
 ) -> NDArray[np.float64] | None:
     """Make one quick, seeded draw with cv2's USAC: MSAC score, inner local optimisation.
+
+    Samples are uniform, or PROSAC's if the points come best first.
 
     Returns
     -------
@@ -128,7 +142,7 @@ def draw(
     params.confidence = confidence
     params.maxIterations = max_iters
     params.randomGeneratorState = (seed + 2**31) % 2**32 - 2**31  # a signed 32-bit field
-    params.sampler = cv2.SAMPLING_UNIFORM
+    params.sampler = cv2.SAMPLING_PROSAC if best_first else cv2.SAMPLING_UNIFORM
     params.score = cv2.SCORE_METHOD_MSAC
     params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
     params.loIterations = 5

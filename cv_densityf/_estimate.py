@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
 from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cv_densityf._consensus import eight_point_ransac, search
+from cv_densityf._consensus import eight_point_ransac, refine, search
 from cv_densityf._engine import Robust, method_flag, method_name
 from cv_densityf._epipolar import inlier_mask
 from cv_densityf._prefilter import contrast_support, paper_support
@@ -21,8 +21,14 @@ DENSITIES = get_args(Density)
 
 #: With fewer matches cv2 turns RANSAC into LMEDS, and there is no density to speak of.
 MIN_FILTERED = 15
-#: More matches than this add nothing to F: the search runs on a seeded subset, the mask on all.
+#: More matches than this do not help to find F: the search runs on a seeded subset of this size.
 MAX_SEARCHED = 5_000
+#: They do help to refine it, up to what memory should bear.
+MAX_REFINED = 100_000
+#: For LMEDS, which has no threshold: this part of the points' spread, some 3 px in a photograph.
+_LMEDS_THRESHOLD = 0.01
+#: An F that explains fewer matches than a minimal sample is none.
+_MINIMAL = 7
 #: cv2's direct kernels take every match as true.
 _DIRECT = (1, 2)
 
@@ -99,27 +105,36 @@ def run(
     with np.errstate(over="ignore"):
         finite = np.asarray(np.isfinite(X.astype(np.float32)).all(axis=1))  # as cv2 sees them
     rows = np.flatnonzero(finite)
-    if density == "off" or robust.flag in _DIRECT or len(rows) < MIN_FILTERED:
+    direct = robust.params is None and robust.flag in _DIRECT
+    if density == "off" or direct or len(rows) < MIN_FILTERED:
         why = "density is off" if density == "off" else f"{method_name(robust)} takes no filter"
         if len(rows) < MIN_FILTERED:
             why = f"fewer than {MIN_FILTERED} finite matches"
         return _plain(X, finite, robust, watch, f"cv2's own call, since {why}")
+    others = rows[:0]
     if len(rows) > MAX_SEARCHED:
-        rows = np.sort(np.random.default_rng(abs(seed)).choice(rows, MAX_SEARCHED, replace=False))
+        shuffled = np.random.default_rng(abs(seed)).permutation(rows)
+        rows, others = np.sort(shuffled[:MAX_SEARCHED]), shuffled[MAX_SEARCHED:MAX_REFINED]
     Z = X[rows] if len(rows) < n else X
     if _on_a_line(Z[:, :2]) or _on_a_line(Z[:, 2:]):
         return _plain(X, finite, robust, watch, "cv2's own call, since all points are on a line")
+    if scores is None and robust.best_first:
+        scores = -np.arange(n, dtype=np.float64)
+    trust = None if scores is None else scores[rows]
     if density == "paper":
         r, support = paper_support(Z, alpha, dc_percent)
     else:
-        r, support = contrast_support(Z, None if scores is None else scores[rows])
+        r, support = contrast_support(Z, trust)
     reliability = np.full(n, np.nan)
     reliability[rows] = r
     kept = np.zeros(n, dtype=bool)
     kept[rows] = support
     watch.lap("density")
+    threshold = robust.threshold
+    if robust.rule == "lmeds":  # makes a threshold of its own, whatever the unit of the points
+        threshold = _LMEDS_THRESHOLD * float(np.sqrt(((Z - Z.mean(axis=0)) ** 2).mean()))
     asked: dict[str, Any] = {
-        "threshold": robust.threshold,
+        "threshold": threshold,
         "confidence": robust.confidence,
         "max_iters": robust.max_iters,
         "seed": seed,
@@ -130,7 +145,12 @@ def run(
                 found = eight_point_ransac(Z[support], **asked)
                 watch.lap("draws")
             else:
-                found = search(Z, r, watch=watch, **asked)
+                found = search(Z, r, watch=watch, scores=trust, **asked)
+                if found is not None and len(others):
+                    whole = np.concatenate([Z, X[others]])
+                    F = refine(found.F, whole, np.flatnonzero(support), threshold)
+                    found = replace(found, F=F)
+                    watch.lap("polish")
         except np.linalg.LinAlgError:
             found = None
     if found is None:
@@ -139,6 +159,10 @@ def run(
         )
     mask = inlier_mask(found.F, X, robust.rule, robust.threshold)
     watch.lap("mask")
+    if np.count_nonzero(mask) < _MINIMAL:
+        return _plain(
+            X, finite, robust, watch, "cv2's own call, since too few matches fit at this threshold"
+        )
     return Estimate(
         F=found.F,
         mask=mask,
@@ -218,7 +242,7 @@ def estimate_fundamental(
         Name (``"ransac"``, ``"lmeds"``, ``"usac_magsac"``, ...) or cv2 constant. It decides the
         rule of the inlier mask, and the call that answers where density cannot help.
     threshold : float
-        Largest residual of an inlier, pixels, above 0.
+        Largest residual of an inlier, pixels, above 0; unused by ``"lmeds"``, which finds its own.
     confidence : float
         Of each draw to have found the best model, in (0, 1).
     max_iters : int
@@ -247,7 +271,7 @@ def estimate_fundamental(
 
     References
     ----------
-    H. Wu and Y. Wan, "Fundamental matrix estimation based on clustering by density peaks".
+    H. Wu and Y. Wan, "Clustering assisted fundamental matrix estimation" (2015).
 
     Examples
     --------
@@ -272,12 +296,10 @@ def estimate_fundamental(
             raise ValueError(f"scores has {len(trust)} entries for {len(first)} matches")
         if np.isnan(trust).any():
             raise ValueError("scores has NaN; give matches of unknown trust the lowest score")
-    _check("threshold", threshold, Real, lambda v: 0 < v < np.inf, "a finite number above 0")
+    _check("threshold", threshold, Real, lambda v: 1e-12 < v < 1e6, "a number above 0, below 1e6")
     _check("confidence", confidence, Real, lambda v: 0 < v < 1, "a number inside (0, 1)")
     _check("max_iters", max_iters, Integral, lambda v: v >= 1, "an integer, at least 1")
-    _check("density", density, str, DENSITIES.__contains__, f"one of {', '.join(DENSITIES)}")
-    _check("alpha", alpha, Real, lambda v: 0 <= v <= 1, "a number from 0 to 1")
-    _check("dc_percent", dc_percent, Real, lambda v: 0 < v <= 100, "a number in (0, 100]")
+    check_density(density, alpha, dc_percent)
     in_range = range(2**31).__contains__
     _check("random_state", random_state, Integral, in_range, "an integer from 0 to 2^31 - 1")
     return run(
@@ -289,6 +311,13 @@ def estimate_fundamental(
         scores=trust,
         seed=int(random_state),
     )
+
+
+def check_density(density: Any, alpha: Any, dc_percent: Any) -> None:
+    """Raise ValueError, with what to do, for options of the density rules out of range."""
+    _check("density", density, str, DENSITIES.__contains__, f"one of {', '.join(DENSITIES)}")
+    _check("alpha", alpha, Real, lambda v: 0 <= v <= 1, "a number from 0 to 1")
+    _check("dc_percent", dc_percent, Real, lambda v: 0 < v <= 100, "a number in (0, 100]")
 
 
 def _points(points: ArrayLike, name: str) -> NDArray[np.float64]:

@@ -60,6 +60,9 @@ def read_matches(
         X, scores = _read_npz(path) if suffix == ".npz" else _read_csv(path)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
+    if scores is not None and np.isnan(scores).any():
+        row = int(np.flatnonzero(np.isnan(scores))[0]) + 1
+        raise InputError(f"{path}: the score of match {row} is NaN; give a low score instead")
     return np.ascontiguousarray(X, dtype=np.float64), scores
 
 

@@ -37,7 +37,7 @@ def add_run(commands: argparse._SubParsersAction[Any]) -> None:
         "--density",
         choices=("contrast", "paper", "off"),
         default="contrast",
-        help="how matches are chosen to draw from (%(default)s)",
+        help="how the dense matches are chosen (%(default)s)",
     )
     parser.add_argument("-m", dest="module", action="store_true", help="as in python -m")
     parser.add_argument(

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cv_densityf._engine import Robust, is_usac, original
 from cv_densityf._epipolar import inlier_mask
-from cv_densityf._estimate import MIN_FILTERED, Density, Estimate, run
+from cv_densityf._estimate import MIN_FILTERED, Density, Estimate, check_density, run
 from cv_densityf._overloads import Call, resolve
 from cv_densityf._points import as_array, as_matches, as_umat, n_points
 
@@ -31,6 +31,9 @@ _MAGSAC_MIN_THRESHOLD = 1e-3
 
 #: cv2 calls a smaller F[2, 2] zero, and leaves the scale alone.
 _FLOAT32_EPSILON = float(np.finfo(np.float32).eps)
+
+#: cv2 leaves masks of these types alone, and answers with one of its own.
+_IGNORED_MASKS = frozenset(np.dtype(t) for t in ("i1", "i2", "u2", "i4", "f4", "f8"))
 
 #: No image is this wide: every match is an inlier, and there is nothing to estimate.
 _MAX_THRESHOLD = 1e6
@@ -155,7 +158,7 @@ def findFundamentalMat(
     confidence : float, default 0.99
         Confidence wanted, inside (0, 1); other values are cv2's own call.
     maxIters : int, default 1000
-        Most samples drawn. cv2 takes it only together with the three before it.
+        Most samples of a draw. cv2 takes it only together with the three before it.
     mask : array, optional
         Output array, used as cv2 uses it: a writable contiguous uint8 (N, 1) array is filled and
         returned.
@@ -197,6 +200,11 @@ def findFundamentalMat(
 
     Notes
     -----
+    On the default path the threshold, the confidence and the seed of ``params`` count, its sampler
+    only as far as PROSAC's means that the rows come best first. A draw ends after at most
+    ``maxIters`` samples and after 1,000; there are up to eleven draws. Of more than 5,000 matches a
+    seeded 5,000 are searched; up to 100,000 refine the result, and the mask is over all.
+
     Deliberate differences from cv2: where ``FM_RANSAC`` and ``FM_LMEDS`` find no model cv2 returns
     uninitialised memory as the mask and leaves a given ``mask`` as it was; here both are zeros.
     Where cv2's solver raises on valid points, or would take the process down (graph cut on more
@@ -233,7 +241,7 @@ def find(
     scores: ArrayLike | None = None,
 ) -> tuple[Any, Estimate | None]:
     """Answer a call of cv2's function, and say how: None where the answer is cv2's own."""
-    check_options(density, alpha, dc_percent)
+    check_density(density, alpha, dc_percent)
     call = resolve(args, kwargs)
     if call is None:
         return original(*args, **kwargs), None
@@ -310,9 +318,11 @@ def _mask_slot(call: Call, n: int, usac: bool) -> _MaskSlot | None:
     if isinstance(mask, (int, float)) and call.params is None:
         # cv2 takes a number for an array of its own and drops it: the fate of maxIters=1000.0.
         return _MaskSlot(None, False)
-    if type(mask) is not np.ndarray or mask.dtype != np.uint8:
+    if type(mask) is not np.ndarray or not mask.flags.writeable:
         return None
-    if not (mask.flags.c_contiguous and mask.flags.writeable):
+    if mask.dtype in _IGNORED_MASKS or (mask.dtype == np.uint8 and mask.size != n):
+        return _MaskSlot(None, False)
+    if mask.dtype != np.uint8 or not mask.flags.c_contiguous:
         return None
     if mask.shape == (n, 1) or (mask.shape == (n,) and not (usac and _OPENCV_5)):
         return _MaskSlot(mask, False)
@@ -404,16 +414,6 @@ def _no_model(call: Call, n: int, usac: bool, slot: _MaskSlot) -> tuple[None, An
     # cv2's direct solvers count every point as an inlier, model or not.
     direct = not usac and (n == 7 or call.method == cv2.FM_8POINT)
     return None, slot.deliver(np.full(n, direct))
-
-
-def check_options(density: str, alpha: float, dc_percent: float) -> None:
-    """Raise ValueError, with what to do, for options out of range."""
-    if density not in ("contrast", "paper", "off"):
-        raise ValueError(f"density must be 'contrast', 'paper' or 'off', not {density!r}")
-    if not 0 <= alpha < math.inf:
-        raise ValueError(f"alpha must be a finite number of at least 0, not {alpha!r}")
-    if not 0 < dc_percent <= 100:
-        raise ValueError(f"dc_percent must be above 0 and at most 100, not {dc_percent!r}")
 
 
 def _check_scores(scores: ArrayLike, n: int | None) -> NDArray[np.float64]:

@@ -396,7 +396,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
     Parameters
     ----------
     prefilter : "auto", None or an estimator, default="auto"
-        Which matches the hypotheses are drawn from. ``"auto"``: the pipeline of
+        Which matches are trusted first. ``"auto"``: the pipeline of
         `cv_densityf.estimate_fundamental`. None: all, a plain call of cv2. Or an object whose
         ``fit_predict(X)`` answers a boolean mask or +-1, one per row: a `DensityPeaksFilter`, an
         outlier detector like scikit-learn's IsolationForest; cv2 is then called on the rows it
@@ -423,7 +423,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
     n_inliers_ : int
         Their number.
     candidate_mask_ : ndarray of bool, shape (n,)
-        Rows of fit that hypotheses were drawn from.
+        Rows of fit in the dense part, or those that the prefilter kept.
     prefilter_ : estimator or None
         The fitted prefilter, None where ``prefilter`` is "auto" or None.
     threshold_ : float

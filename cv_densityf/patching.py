@@ -18,7 +18,7 @@ import cv2
 
 from cv_densityf import cv2_api
 from cv_densityf._engine import original
-from cv_densityf._estimate import Density, Estimate
+from cv_densityf._estimate import Density, Estimate, check_density
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class CallSite:
     no_model : int
         Calls, not passed on, that found no fundamental matrix.
     kept, dropped : int
-        Matches that hypotheses were drawn from, and the rest, over all calls not passed on.
+        Matches of the dense part, and the rest, over all calls not passed on.
     """
 
     filename: str
@@ -212,7 +212,7 @@ def reset_call_sites() -> None:
 
 
 def _checked(density: Density, alpha: float, dc_percent: float) -> _Patch:
-    cv2_api.check_options(density, alpha, dc_percent)
+    check_density(density, alpha, dc_percent)
     return _Patch(density, alpha, dc_percent)
 
 

@@ -71,7 +71,7 @@ def plot_decision_graph(
     alpha : float
         The curve is where rho * delta = alpha * max(rho) * max(delta).
     kept : (n,) array of bool, optional
-        Matches that hypotheses were drawn from; by default those on or above the curve.
+        Matches of the dense part; by default those on or above the curve.
     mask : (n,) array of bool, optional
         Inliers of the final fundamental matrix; by default they are not told apart.
     ax : matplotlib.axes.Axes, optional
@@ -151,7 +151,7 @@ def plot_matches(
     X : (n, 4) array
         The columns x, y, x', y', in pixels; rows that are not finite are left out.
     kept : (n,) array of bool, optional
-        Matches that hypotheses were drawn from; by default all.
+        Matches of the dense part; by default all.
     mask : (n,) array of bool, optional
         Inliers of the final fundamental matrix; by default they are not told apart.
     max_lines : int
@@ -308,7 +308,7 @@ def summary_figure(
     F : (3, 3) array
         Fundamental matrix.
     kept, mask : (n,) array of bool
-        Matches that hypotheses were drawn from, and inliers of ``F``.
+        Matches of the dense part, and inliers of ``F``.
     peaks : DensityPeaksResult
         Density peaks of ``X``.
     alpha : float

@@ -133,7 +133,7 @@ def test_people_read_the_same_numbers(run, npz):
     assert (code, err) == (0, "")
     assert text.startswith("400 matches, usac_accurate, threshold 1 px\n")
     for line, ours, plain in (
-        ("kept to draw from", report["n_kept"], 400),
+        ("kept as dense", report["n_kept"], 400),
         ("inliers", report["n_inliers"], report["cv2"]["n_inliers"]),
         (
             "median residual, px",

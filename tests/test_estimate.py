@@ -572,3 +572,26 @@ def test_the_explanation_runs():
     report = []
     doctest.DocTestRunner().run(test, out=report.append)
     assert not report, "".join(report)
+
+
+def test_matches_beyond_the_search_refine_the_result(monkeypatch):
+    searched, all_rows = [], []
+    for seed in range(6):
+        scene = two_view_scene(3000, inlier_ratio=0.5, noise=1.0, random_state=seed)
+        exact = two_view_scene(3000, inlier_ratio=0.5, noise=0.0, random_state=seed)
+        X = np.hstack([exact.points1, exact.points2])[exact.inliers]
+        for errors, refined in ((searched, 500), (all_rows, 100_000)):
+            monkeypatch.setattr("cv_densityf._estimate.MAX_SEARCHED", 500)
+            monkeypatch.setattr("cv_densityf._estimate.MAX_REFINED", refined)
+            estimate = estimate_fundamental(scene.points1, scene.points2)
+            errors.append(np.median(sampson_distance(estimate.F, X)))
+    assert np.mean(all_rows) < 0.7 * np.mean(searched)
+
+
+def test_an_f_that_fits_next_to_nothing_is_not_ours():
+    scene = scene_of(seed=3)
+    estimate = estimate_fundamental(
+        scene.points1, scene.points2, method="usac_default", threshold=1e-7
+    )
+    assert estimate.engine == "usac_default"
+    assert "too few matches fit" in estimate.reason
