@@ -118,8 +118,6 @@ def run(
     Z = X[rows] if len(rows) < n else X
     if _on_a_line(Z[:, :2]) or _on_a_line(Z[:, 2:]):
         return _plain(X, finite, robust, watch, "cv2's own call, since all points are on a line")
-    if scores is None and robust.best_first:
-        scores = -np.arange(n, dtype=np.float64)
     trust = None if scores is None else scores[rows]
     if density == "paper":
         r, support = paper_support(Z, alpha, dc_percent)
@@ -145,6 +143,8 @@ def run(
                 found = eight_point_ransac(Z[support], **asked)
                 watch.lap("draws")
             else:
+                if trust is None and robust.best_first:
+                    trust = -rows.astype(np.float64)
                 found = search(Z, r, watch=watch, scores=trust, **asked)
                 if found is not None and len(others):
                     whole = np.concatenate([Z, X[others]])
