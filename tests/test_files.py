@@ -121,7 +121,12 @@ class TestCsv:
             header += ",score"
         lines = [header] if header else []
         lines += [",".join(repr(float(value)) for value in row) for row in table]
-        found, scores = self.read(tmp_path_factory.getbasetemp(), end.join(lines) + end)
+        text = end.join(lines) + end
+        if np.isnan(table[:, 4:]).any():
+            with pytest.raises(InputError, match="the score of match .* is NaN"):
+                self.read(tmp_path_factory.getbasetemp(), text)
+            return
+        found, scores = self.read(tmp_path_factory.getbasetemp(), text)
         np.testing.assert_array_equal(found, table[:, :4])
         if table.shape[1] == 5:
             np.testing.assert_array_equal(scores, table[:, 4])
