@@ -123,7 +123,7 @@ class TestCsv:
         lines += [",".join(repr(float(value)) for value in row) for row in table]
         text = end.join(lines) + end
         if np.isnan(table[:, 4:]).any():
-            with pytest.raises(InputError, match="the score of match .* is NaN"):
+            with pytest.raises(InputError, match=r"the score of match \d+ is NaN"):
                 self.read(tmp_path_factory.getbasetemp(), text)
             return
         found, scores = self.read(tmp_path_factory.getbasetemp(), text)
