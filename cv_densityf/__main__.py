@@ -22,7 +22,7 @@ import cv_densityf
 from cv_densityf._density import density_peaks
 from cv_densityf._engine import GRAPH_CUT_MAX, METHODS, Robust, method_flag
 from cv_densityf._epipolar import Floats, residuals
-from cv_densityf._estimate import Estimate, estimate_fundamental
+from cv_densityf._estimate import Estimate, estimate_fundamental, finite_in_cv2
 from cv_densityf._files import InputError, read_matches, replacing
 from cv_densityf._run_script import add_run, run_script
 from cv_densityf.matching import (
@@ -478,8 +478,7 @@ def _draw(
 ) -> None:
     from cv_densityf import plotting
 
-    with np.errstate(over="ignore"):
-        rows = np.flatnonzero(np.isfinite(X.astype(np.float32)).all(axis=1))  # as cv2 sees them
+    rows = np.flatnonzero(finite_in_cv2(X))
     rows = rows[:: max(1, -(-len(rows) // _MAX_GRAPH_POINTS))]
     figure = plotting.summary_figure(
         *images,

@@ -102,8 +102,7 @@ def run(
     """Estimate F from trusted arguments: X (n, 4) float64, whose rows may hold NaN or Inf."""
     watch = Stopwatch()
     n = len(X)
-    with np.errstate(over="ignore"):
-        finite = np.asarray(np.isfinite(X.astype(np.float32)).all(axis=1))  # as cv2 sees them
+    finite = finite_in_cv2(X)
     rows = np.flatnonzero(finite)
     direct = robust.params is None and robust.flag in _DIRECT
     if density == "off" or direct or len(rows) < MIN_FILTERED:
@@ -174,6 +173,12 @@ def run(
         timings=watch.laps,
         votes=found.votes,
     )
+
+
+def finite_in_cv2(X: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Whether each match is finite in float32, as cv2 sees it."""
+    with np.errstate(over="ignore"):
+        return np.asarray(np.isfinite(X.astype(np.float32)).all(axis=1))
 
 
 def _on_a_line(points: NDArray[np.float64]) -> bool:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import rankdata
 from sklearn.base import BaseEstimator, ClusterMixin, MetaEstimatorMixin, clone
 from sklearn.utils import _safe_indexing, check_random_state
 from sklearn.utils._param_validation import HasMethods, Interval, StrOptions
@@ -34,7 +33,7 @@ from cv_densityf._density import density_peaks
 from cv_densityf._display import DecisionGraphDisplay
 from cv_densityf._engine import METHODS, Robust, method_flag
 from cv_densityf._estimate import MIN_FILTERED, run
-from cv_densityf._prefilter import contrast_support, paper_support
+from cv_densityf._prefilter import contrast_support, paper_support, ranks
 
 if TYPE_CHECKING:
     from cv_densityf._epipolar import Rule
@@ -323,7 +322,7 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
         else:
             reliability, support = paper_support(matches, self.alpha, self.dc_percent)
         if weight is not None:
-            reliability = (_ranks(reliability) + _ranks(weight)) / 2
+            reliability = (ranks(reliability) + ranks(weight)) / 2
         if weight is not None or self.keep is not None:
             n_kept = round(self.keep * n) if self.keep is not None else np.count_nonzero(support)
             support = np.zeros(n, dtype=bool)
@@ -690,11 +689,6 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
     def _residuals(self, matches: NDArray[np.float64]) -> NDArray[np.float64]:
         distance = _epipolar.residuals(self.F_, matches, self._rule)
         return np.where(np.isnan(distance), np.inf, distance)
-
-
-def _ranks(values: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Ranks in [0, 1], 1 for the largest; equal values share theirs."""
-    return np.asarray((rankdata(values) - 1) / max(len(values) - 1, 1))
 
 
 def _enough(support: NDArray[np.bool_]) -> NDArray[np.bool_]:
