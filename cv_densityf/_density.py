@@ -149,10 +149,10 @@ class DensityPeaksResult:
         rows = np.flatnonzero(~halo)
         if not rows.size:
             return halo
-        on_border = rows[_has_foreign_neighbor(self.X[rows], label[rows], self.dc)]
         clusters, member = np.unique(label[rows], return_inverse=True)
+        on_border = _has_foreign_neighbor(self.X[rows], member, self.dc)
         border_rho = np.full(len(clusters), -np.inf)
-        np.maximum.at(border_rho, np.searchsorted(clusters, label[on_border]), self.rho[on_border])
+        np.maximum.at(border_rho, member[on_border], self.rho[rows[on_border]])
         halo[rows] = self.rho[rows] <= border_rho[member]
         return halo
 
@@ -361,14 +361,19 @@ def _nearest_earlier_distinct(P: Floats) -> tuple[Ints, Floats]:
     return nearest, distance
 
 
-def _has_foreign_neighbor(X: Floats, labels: NDArray[np.integer], dc: float) -> NDArray[np.bool_]:
-    """Whether a point with another label lies nearer than ``dc``."""
-    tree = cKDTree(X, leafsize=_LEAFSIZE)
+def _has_foreign_neighbor(X: Floats, member: Ints, dc: float) -> NDArray[np.bool_]:
+    """Whether a point of another cluster lies nearer than ``dc``; clusters count from 0."""
+    _, first, copy_of = np.unique(X, axis=0, return_index=True, return_inverse=True)
+    copy_of = copy_of.ravel()
     result = np.zeros(len(X), dtype=bool)
-    # In the tree's own order a block is compact, and its pairs are found together.
-    ends = np.cumsum(tree.query_ball_point(X[tree.indices], dc, return_length=True))
-    for rows in np.split(tree.indices, np.flatnonzero(np.diff(ends // _BLOCK)) + 1):
-        pairs = cKDTree(X[rows]).sparse_distance_matrix(tree, dc, output_type="ndarray")
-        foreign = (labels[rows][pairs["i"]] != labels[pairs["j"]]) & (pairs["v"] < dc)
-        result[rows[pairs["i"][foreign]]] = True
+    # Numbers of two clusters differ in some bit; for each, the nearest with the other bit decides.
+    for bit in range(int(member.max()).bit_length()):
+        odd = (member >> bit) % 2 == 1
+        for side in (odd, ~odd):
+            rows = np.flatnonzero(side & ~result)
+            others = first[np.unique(copy_of[~side])]
+            to_other, _ = cKDTree(X[others], leafsize=_LEAFSIZE).query(
+                X[rows], distance_upper_bound=dc * (1 + _ROUNDING)
+            )
+            result[rows] = to_other < dc
     return result
