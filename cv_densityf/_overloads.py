@@ -21,6 +21,7 @@ WITH_DEFAULTS = ("points1", "points2", "method", "ransacReprojThreshold", "confi
 WITH_PARAMS = ("points1", "points2", "params", "mask")
 
 _INT32 = range(-(2**31), 2**31)
+_FLOATS: tuple[type[Any], ...] = (float, int, np.integer, np.float32, np.float16)
 
 
 class Call(NamedTuple):
@@ -124,9 +125,7 @@ def _as_float(value: Any, if_none: float) -> float | None:
     """Return the value of cv2's ``double`` slot, or None where cv2 refuses ``value``."""
     if value is None:
         return if_none
-    if isinstance(value, (bool, np.timedelta64)) or not isinstance(
-        value, (float, int, np.integer, np.float32, np.float16)
-    ):
+    if isinstance(value, (bool, np.timedelta64)) or not isinstance(value, _FLOATS):
         return None
     try:
         return float(value)

@@ -67,7 +67,7 @@ def epipolar_distance(
     2.0
     """
     F0, F1 = _matrix(F0, "F0"), _matrix(F1, "F1")
-    sizes = _size(size1, "size1"), _size(size2, "size2")
+    whole1, whole2 = _size(size1, "size1"), _size(size2, "size2")
     if n < 1:
         raise ValueError(f"n is {n}; draw at least one point")
     scales = [float(np.abs(F).max()) for F in (F0, F1)]
@@ -78,7 +78,7 @@ def epipolar_distance(
     seed = int(np.random.default_rng(random_state).integers(2**63))
     distances = [
         _one_way(F, G, *ends, n, np.random.default_rng(seed))
-        for A, B, ends in ((F0, F1, sizes), (F0.T, F1.T, sizes[::-1]))
+        for A, B, ends in ((F0, F1, (whole1, whole2)), (F0.T, F1.T, (whole2, whole1)))
         for F, G in ((A, B), (B, A))
     ]
     return float(np.mean(distances))

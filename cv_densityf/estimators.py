@@ -190,11 +190,16 @@ class DensityPeaks(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             else peaks.centers(n=self.n_clusters)
         )
         labels = peaks.labels(centers)
-        self.halo_mask_ = peaks.halo(labels)
-        self.labels_ = np.where(self.halo_mask_, -1, labels) if self.halo else labels
-        self.cluster_centers_indices_ = centers
-        self.rho_, self.delta_, self.gamma_ = peaks.rho, peaks.delta, peaks.gamma
-        self.dc_, self.predecessor_ = peaks.dc, peaks.predecessor
+        self.halo_mask_: NDArray[np.bool_] = peaks.halo(labels)
+        self.labels_: NDArray[np.intp] = (
+            np.where(self.halo_mask_, -1, labels) if self.halo else labels
+        )
+        self.cluster_centers_indices_: NDArray[np.intp] = centers
+        self.rho_: NDArray[np.float64] = peaks.rho
+        self.delta_: NDArray[np.float64] = peaks.delta
+        self.gamma_: NDArray[np.float64] = peaks.gamma
+        self.dc_: float = peaks.dc
+        self.predecessor_: NDArray[np.intp] = peaks.predecessor
         return self
 
 
@@ -327,9 +332,9 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
             n_kept = round(self.keep * n) if self.keep is not None else np.count_nonzero(support)
             support = np.zeros(n, dtype=bool)
             support[np.argsort(-reliability, kind="stable")[:n_kept]] = True
-        self.reliability_ = reliability
-        self.support_ = _enough(support)
-        self.sample_indices_ = np.flatnonzero(self.support_)
+        self.reliability_: NDArray[np.float64] = reliability
+        self.support_: NDArray[np.bool_] = _enough(support)
+        self.sample_indices_: NDArray[np.intp] = np.flatnonzero(self.support_)
         return self
 
     def _validated(self, X: ArrayLike) -> NDArray[np.float64]:
@@ -538,7 +543,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         )
         prefilter_params = self._prefilter_params(weight, params)
 
-        self.prefilter_ = None
+        self.prefilter_: Any = None
         if isinstance(self.prefilter, str):
             estimate = run(matches, robust, scores=weight, seed=self._seed())
             F, candidates, reason = estimate.F, estimate.kept, estimate.reason
@@ -556,11 +561,11 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
                 f"threshold larger than {self.threshold:g} px, more max_iters, another method, "
                 "or matches that are not all on one line or plane"
             )
-        self.F_ = F
-        self.candidate_mask_ = candidates
+        self.F_: NDArray[np.float64] = F
+        self.candidate_mask_: NDArray[np.bool_] = candidates
         self._set_rule(robust, matches)
-        self.inlier_mask_ = self._inliers(matches)
-        self.n_inliers_ = int(np.count_nonzero(self.inlier_mask_))
+        self.inlier_mask_: NDArray[np.bool_] = self._inliers(matches)
+        self.n_inliers_: int = int(np.count_nonzero(self.inlier_mask_))
         return self
 
     def predict(self, X: ArrayLike) -> NDArray[np.bool_]:
@@ -675,7 +680,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
             rule = "ransac"
         elif rule == "ransac" and len(matches) < MIN_FILTERED:
             rule = "lmeds"
-        self.threshold_ = robust.threshold
+        self.threshold_: float = robust.threshold
         if rule == "lmeds":
             # The scale is that of the rows of fit; from then on the rule is RANSAC's.
             errors = np.square(_epipolar.residuals(self.F_, matches, rule)).astype(np.float32)

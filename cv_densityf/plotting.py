@@ -105,7 +105,7 @@ def plot_decision_graph(
     """
     rho, delta = np.asarray(peaks.rho), np.asarray(peaks.delta)
     product = alpha * rho.max(initial=0) * delta.max(initial=0)
-    on_or_above = rho * delta >= product
+    on_or_above: NDArray[np.bool_] = rho * delta >= product
     kept = on_or_above if kept is None else _mask(kept, len(rho), "kept")
     mask = None if mask is None else _mask(mask, len(rho), "mask")
     ax = _axes(ax, (16, 7))
@@ -451,7 +451,7 @@ def _show(
             )  # fmt: skip
         frame = np.array([[left, right, right, left, left], [top, top, bottom, bottom, top]])
         ax.plot(*frame, color="0.4", lw=1, zorder=1, clip_on=False)
-    ax.set(xlim=(0, right), ylim=(height, 0), aspect="equal")
+    ax.set(xlim=(0, places[1](extent2)[1, 0]), ylim=(height, 0), aspect="equal")
     ax.axis("off")
     return places
 
