@@ -224,9 +224,9 @@ def polish(frame: Frame, G: Floats, scales: Sequence[float | Floats]) -> Floats:
     U, S, Vt = np.linalg.svd(G)
     angle = np.arctan2(S[:, 1], S[:, 0])
     m = len(G)
+    D = np.zeros((m, 3, 3))
     for scale in scales:
         c, s = np.cos(angle), np.sin(angle)
-        D = np.zeros((m, 3, 3))
         D[:, 0, 0], D[:, 1, 1] = c, s
         G = U @ D @ Vt
         algebraic, norm = frame.errors(G)
