@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -71,6 +72,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _complain(f"{where}{error.strerror or error}", WRONG_USE)
     except (InputError, ImportError) as error:
         return _complain(str(error), WRONG_USE)
+    except MemoryError:
+        return _complain("not enough memory for this input", WRONG_USE)
     except KeyboardInterrupt:
         return _complain("interrupted", 130)
 
@@ -120,7 +123,7 @@ def _number(
     return parse
 
 
-_POSITIVE = _number(float, lambda v: 0 < v < float("inf"), "a positive number")
+_THRESHOLD = _number(float, lambda v: 1e-12 < v < 1e6, "a positive number between 1e-12 and 1e6")
 _POSITIVE_INT = _number(int, lambda v: 0 < v < 2**31, "a positive whole number")
 _SEED = _number(int, lambda v: 0 <= v < 2**31, "a whole number from 0 to 2147483647")
 _SHARE = _number(float, lambda v: 0 < v < 1, "a number between 0 and 1")
@@ -165,7 +168,7 @@ def _add_match(commands: argparse._SubParsersAction[Any]) -> None:
     estimate.add_argument(
         "--threshold",
         metavar="PX",
-        type=_POSITIVE,
+        type=_THRESHOLD,
         default=1.0,
         help="for inliers, pixels (%(default)s)",
     )
@@ -247,7 +250,7 @@ def _add_verify(commands: argparse._SubParsersAction[Any]) -> None:
     verify.add_argument(
         "--threshold",
         metavar="PX",
-        type=_POSITIVE,
+        type=_THRESHOLD,
         default=4.0,
         help="for inliers, pixels (%(default)s, as COLMAP)",
     )
@@ -283,6 +286,26 @@ def _stage(name: str, timings: dict[str, float]) -> Iterator[None]:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
 
+@contextmanager
+def _own_words() -> Iterator[None]:
+    """Hold back what image decoders print on their own: they do where we are about to say it."""
+    try:
+        terminal = os.dup(2)
+    except OSError:  # there is no standard error
+        yield
+        return
+    with tempfile.TemporaryFile() as said:
+        os.dup2(said.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(terminal, 2)
+            os.close(terminal)
+        # The image was read in spite of it: a damaged JPEG file, say.
+        said.seek(0)
+        os.write(2, said.read())
+
+
 def _run_match(options: argparse.Namespace) -> int:
     image_options = ("ratio", "max_features", "max_size")
     if options.points is None and len(options.images) != 2:
@@ -304,7 +327,7 @@ def _run_match(options: argparse.Namespace) -> int:
         with _stage("reading", timings):
             X, scores = read_matches(options.points)
     else:
-        with _stage("reading", timings):
+        with _stage("reading", timings), _own_words():
             images = (read_image(options.images[0]), read_image(options.images[1]))
         limits = {
             "max_size": options.max_size or MAX_SIZE,
@@ -405,7 +428,8 @@ def _usable(F: Floats | None) -> list[list[float]] | None:
 def _median_residual(F: Floats | None, X: Floats, robust: Robust) -> float | None:
     if F is None or len(X) == 0 or F.shape != (3, 3):
         return None
-    median = float(np.median(residuals(F, X, robust.rule)))
+    with np.errstate(over="ignore"):  # cv2 calls even a point beyond float32 an inlier
+        median = float(np.median(residuals(F, X, robust.rule)))
     return median if np.isfinite(median) else None
 
 

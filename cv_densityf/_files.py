@@ -5,12 +5,24 @@ from __future__ import annotations
 import csv
 import os
 import zipfile
+from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
+from numpy.lib.format import MAGIC_PREFIX
 from numpy.typing import NDArray
+
+#: No file is read that holds more matches: memory would not bear what follows either.
+MAX_MATCHES = 10_000_000
+#: Bytes of that many points in the widest numbers there are.
+_MAX_BYTES = 32 * MAX_MATCHES
+#: Longest line of a table, in characters.
+_MAX_LINE = 10_000
+#: Most characters of a file's own text in a message.
+_MAX_SHOWN = 60
 
 _POINT_KEYS = (("points1", "points2"), ("pts1", "pts2"))
 _SCORE_KEYS = ("scores", "score")
@@ -36,7 +48,7 @@ def read_matches(
         ``.npz``: arrays ``points1`` and ``points2`` (or ``pts1`` and ``pts2``), each (n, 2) in
         pixels, and optionally ``scores`` (or ``score``), (n,); pickled objects are refused.
         ``.csv``: comma-separated columns x, y, x', y' and optionally a score; one header row is
-        allowed.
+        allowed. Up to ten million matches are read.
 
     Returns
     -------
@@ -68,19 +80,18 @@ def read_matches(
 
 def _read_npz(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     with path.open("rb") as stream:
-        try:
-            archive = np.load(stream, allow_pickle=False)
-        except (ValueError, EOFError, zipfile.BadZipFile):
-            raise InputError("not a NumPy .npz archive") from None
-        if not isinstance(archive, np.lib.npyio.NpzFile):
+        if stream.read(len(MAGIC_PREFIX)) == MAGIC_PREFIX:
             raise InputError("a single array; save points1 and points2 with numpy.savez")
-        names = next((pair for pair in _POINT_KEYS if set(pair) <= set(archive.files)), None)
+        with _refusing("not a NumPy .npz archive"):
+            archive = zipfile.ZipFile(stream)
+            members = {each.filename.removesuffix(".npy"): each for each in archive.infolist()}
+        names = next((pair for pair in _POINT_KEYS if members.keys() >= set(pair)), None)
         if names is None:
-            found = ", ".join(archive.files) or "nothing"
+            found = _shortened(", ".join(members) or "nothing")
             raise InputError(f"needs the arrays points1 and points2; it holds {found}")
-        points1, points2 = (_numbers(archive, name) for name in names)
-        score_key = next((key for key in _SCORE_KEYS if key in archive.files), None)
-        scores = None if score_key is None else _numbers(archive, score_key)
+        points1, points2 = (_numbers(archive, members[name], name) for name in names)
+        score_key = next((key for key in _SCORE_KEYS if key in members), None)
+        scores = None if score_key is None else _numbers(archive, members[score_key], score_key)
     for name, points in zip(names, (points1, points2), strict=True):
         if points.ndim != 2 or points.shape[1] != 2:
             raise InputError(f"{name} must have the shape (n, 2), not {points.shape}")
@@ -91,44 +102,71 @@ def _read_npz(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | No
     return np.hstack([points1, points2]), scores
 
 
-def _numbers(archive: np.lib.npyio.NpzFile, name: str) -> NDArray[np.float64]:
-    try:
-        values = archive[name]
-    except (ValueError, zipfile.BadZipFile):
-        raise InputError(f"{name} cannot be read (damaged, or a pickled object)") from None
+def _numbers(archive: zipfile.ZipFile, member: zipfile.ZipInfo, name: str) -> NDArray[np.float64]:
+    too_large = InputError(f"{name} holds more than the {MAX_MATCHES:,} matches that are read")
+    # A small file may unpack to anything, but to no more than it says here.
+    if member.file_size > _MAX_BYTES:
+        raise too_large
+    damaged = f"{name} cannot be read (damaged, or a pickled object)"
+    with _refusing(damaged), archive.open(member) as stream:
+        values = np.lib.format.read_array(stream, allow_pickle=False)
     if values.dtype.kind not in "fiu":
-        raise InputError(f"{name} must hold real numbers, not {values.dtype}")
-    return np.asarray(values, dtype=np.float64)
+        raise InputError(f"{name} must hold real numbers, not {_shortened(str(values.dtype))}")
+    if values.size > 2 * MAX_MATCHES:
+        raise too_large
+    with np.errstate(all="ignore"):
+        return np.asarray(values, dtype=np.float64)
+
+
+@contextmanager
+def _refusing(message: str) -> Iterator[None]:
+    """Raise `InputError` for whatever goes wrong: of damaged bytes decoders raise anything."""
+    try:
+        yield
+    except Exception:
+        raise InputError(message) from None
 
 
 def _read_csv(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            lines = [
-                (number, [cell.strip() for cell in cells])
-                for number, cells in enumerate(csv.reader(stream), start=1)
-                if any(cell.strip() for cell in cells)
-            ]
-    except (UnicodeDecodeError, csv.Error):
-        raise InputError("not a text file of comma-separated values") from None
-    if lines and not _is_number(lines[0][1][0]):
-        _check_header(lines.pop(0)[1])
-    width = len(lines[0][1]) if lines else 4
-    rows = []
-    for number, cells in lines:
+    rows = _csv_rows(path)
+    first = next(rows, None)
+    if first is not None and not _is_number(first[1][0]):
+        _check_header(first[1])
+        first = next(rows, None)
+    if first is None:
+        return np.empty((0, 4)), None
+    width = len(first[1])
+    numbers = array("d")
+    for line, cells in chain([first], rows):
         if width not in (4, 5) or len(cells) != width:
             wanted = "4 or 5" if width not in (4, 5) else str(width)
             raise InputError(
-                f"line {number}: {len(cells)} comma-separated columns, expected {wanted} "
+                f"line {line}: {len(cells)} comma-separated columns, expected {wanted} "
                 "(x, y, x', y' and optionally a score)"
             )
+        if len(numbers) == width * MAX_MATCHES:
+            raise InputError(f"more than the {MAX_MATCHES:,} matches that are read")
         try:
-            rows.append([float(cell) for cell in cells])
+            numbers.extend([float(cell) for cell in cells])
         except ValueError:
             bad = next(cell for cell in cells if not _is_number(cell))
-            raise InputError(f"line {number}: {bad!r} is not a number") from None
-    table = np.array(rows, dtype=np.float64).reshape(-1, width)
+            raise InputError(f"line {line}: {_shortened(bad)!r} is not a number") from None
+    table = np.array(numbers).reshape(-1, width)
     return table[:, :4], table[:, 4] if width == 5 else None
+
+
+def _csv_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield the number and the cells of each line that is not blank."""
+    with path.open(newline="", encoding="utf-8-sig") as stream:
+        # Pieces of lines, since a file without line ends would fill the memory.
+        reader = csv.reader(iter(lambda: stream.readline(_MAX_LINE), ""))
+        try:
+            for row in reader:
+                cells = [cell.strip() for cell in row]
+                if any(cells):
+                    yield reader.line_num, cells
+        except (UnicodeDecodeError, csv.Error):
+            raise InputError("not a text file of comma-separated values in UTF-8") from None
 
 
 def _is_number(cell: str) -> bool:
@@ -139,12 +177,19 @@ def _is_number(cell: str) -> bool:
     return True
 
 
+def _shortened(text: str) -> str:
+    """Text from a file, short enough for a message of one line and harmless to a terminal."""
+    text = text if len(text) <= _MAX_SHOWN else text[: _MAX_SHOWN - 3] + "..."
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
+
+
 def _check_header(cells: list[str]) -> None:
     # Names in another order would swap the images without a word.
     names = tuple(cell.lower() for cell in cells)
+    shown = _shortened(",".join(cells))
     if names[:4] not in _HEADERS or (len(names) == 5 and names[4] not in _SCORE_KEYS):
         raise InputError(
-            f"header {','.join(cells)!r} is not x,y,x',y' or x1,y1,x2,y2, with score as an "
+            f"header {shown!r} is not x,y,x',y' or x1,y1,x2,y2, with score as an "
             "optional fifth name"
         )
 

@@ -16,6 +16,8 @@ from cv_densityf._files import InputError
 MAX_SIZE = 1600
 MAX_FEATURES = 8000
 
+#: Largest file that OpenCV decodes.
+_MAX_BYTES = 2**31 - 1
 #: Rows of the similarity matrix held in memory at a time.
 _CHUNK = 1024
 
@@ -90,6 +92,9 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[Any]:
     InputError
         A ``ValueError``: OpenCV cannot decode the file.
     """
+    # Read whole, this would only be refused by OpenCV.
+    if os.path.getsize(path) > _MAX_BYTES:
+        raise InputError(f"{os.fspath(path)}: larger than the 2 GB that OpenCV can decode")
     # Not cv2.imread: it writes its own warnings, and cannot tell a missing file from a bad one.
     data = np.fromfile(path, dtype=np.uint8)
     try:

@@ -1,7 +1,12 @@
 from __future__ import annotations
 
+import io
+import itertools
 import os
 import pickle
+import struct
+import tracemalloc
+import zipfile
 
 import numpy as np
 import pytest
@@ -9,11 +14,32 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from cv_densityf import _files
 from cv_densityf._files import InputError, read_matches, replacing
 
 RNG = np.random.default_rng(0)
 X = RNG.uniform(0, 1000, (12, 4))
 SCORES = RNG.uniform(0, 1, 12)
+
+
+def npy(array):
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
+def npy_header(shape, descr="<f8"):
+    """The start of an .npy file, which may claim anything."""
+    header = f"{{'descr': {descr!r}, 'fortran_order': False, 'shape': {shape}, }}".encode()
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header
+
+
+def archive(members):
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as found:
+        for name, content in members.items():
+            found.writestr(name, content)
+    return stream.getvalue()
 
 
 class TestNpz:
@@ -76,7 +102,7 @@ class TestNpz:
             read_matches(path)
         assert not (tmp_path / "boom").exists()
 
-    @pytest.mark.parametrize("content", [b"", b"hello", b"PK\x03\x04", b"\x93NUMPY"])
+    @pytest.mark.parametrize("content", [b"", b"hello", b"PK\x03\x04", b"\x93NUM"])
     def test_not_an_archive(self, tmp_path, content):
         path = tmp_path / "matches.npz"
         path.write_bytes(content)
@@ -99,6 +125,115 @@ class TestNpz:
         path.write_bytes(content)
         with pytest.raises(InputError, match="points1 cannot be read"):
             read_matches(path)
+
+    def refused(self, tmp_path, content):
+        path = tmp_path / "matches.npz"
+        path.write_bytes(content)
+        with pytest.raises(InputError) as refusal:
+            read_matches(path)
+        message = str(refusal.value)
+        assert message.isprintable()
+        assert len(message) < len(str(path)) + 200
+        return message.removeprefix(f"{path}: ")
+
+    @pytest.mark.parametrize(
+        "member",
+        [
+            b"",
+            b"hello",
+            b"\x93NUMPY\x01\x00\x04\x00",
+            b"\x93NUMPY\x01\x00\xff\xff" + b"(" * 0xFFFF,
+            b"\x93NUMPY\x01\x00\x14\x00" + b"{'descr': '''abc,\n    ",
+            npy_header("(10000000000000, 2)"),
+            npy_header("(10000000, 2)"),
+            npy_header("(-12, 2)"),
+            npy_header("(12, 2)", "|O") + bytes(400),
+            npy_header("(4611686018427387904, 4)"),
+        ],
+        ids=range(10),
+    )
+    @pytest.mark.parametrize("name", ["points1", "points1.npy"])
+    def test_members_that_are_no_arrays(self, tmp_path, member, name):
+        message = self.refused(tmp_path, archive({name: member, "points2.npy": npy(X[:, 2:])}))
+        assert "points1 cannot be read (damaged, or a pickled object)" in message
+
+    def test_every_byte_of_an_archive_may_be_wrong(self, tmp_path):
+        """Compressed, so that the decompressor meets the damage before the check sum does."""
+        content = archive({"points1.npy": npy(X[:, :2]), "points2.npy": npy(X[:, 2:])})
+        rng = np.random.default_rng(0)
+        refusals = set()
+        for place, value in zip(
+            itertools.chain(range(len(content)), rng.integers(0, len(content), 500)),
+            itertools.chain(itertools.repeat(0xFF, len(content)), rng.integers(0, 255, 500)),
+            strict=True,
+        ):
+            damaged = bytearray(content)
+            damaged[place] = value
+            path = tmp_path / "matches.npz"
+            path.write_bytes(damaged)
+            try:
+                found, _ = read_matches(path)
+            except InputError as error:
+                refusals.add(str(error).split(": ", 1)[1].split(";")[0])
+            else:  # in what nobody reads, such as a date
+                np.testing.assert_array_equal(found, X)
+        assert {"not a NumPy .npz archive", "needs the arrays points1 and points2"} <= refusals
+        assert all(refusal.isprintable() for refusal in refusals)
+
+    def test_encrypted(self, tmp_path):
+        content = bytearray(archive({"points1.npy": npy(X[:, :2]), "points2.npy": npy(X[:, 2:])}))
+        for signature, flags in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+            content[content.find(signature) + flags] |= 1
+        assert "points1 cannot be read" in self.refused(tmp_path, content)
+
+    def test_names_from_the_file_are_shown_short_and_printable(self, tmp_path):
+        names = [f"a\nb\x1b[31m{i}" for i in range(1000)]
+        message = self.refused(tmp_path, archive(dict.fromkeys(names, b"")))
+        assert message.startswith("needs the arrays points1 and points2; it holds a?b?[31m0, a?b")
+
+    def test_more_matches_than_are_read(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(_files, "MAX_MATCHES", 12)
+        for kind in (np.float64, np.int8):
+            whole = archive({f"points{i}.npy": npy(np.ones((12, 2), kind)) for i in (1, 2)})
+            (tmp_path / "matches.npz").write_bytes(whole)
+            assert len(read_matches(tmp_path / "matches.npz")[0]) == 12
+            more = archive({f"points{i}.npy": npy(np.ones((13, 2), kind)) for i in (1, 2)})
+            message = self.refused(tmp_path, more)
+            assert message == "points1 holds more than the 12 matches that are read"
+        text = "1,2,3,4\n" * 12
+        (tmp_path / "matches.csv").write_text("x,y,x',y'\n" + text)
+        assert len(read_matches(tmp_path / "matches.csv")[0]) == 12
+        (tmp_path / "matches.csv").write_text(text + "\n1,2,3,4\n")
+        with pytest.raises(InputError, match="more than the 12 matches that are read"):
+            read_matches(tmp_path / "matches.csv")
+
+    @pytest.mark.parametrize("declared", [2**31, 1000], ids=["as it is", "as if it were small"])
+    def test_a_bomb_is_not_unpacked(self, tmp_path, declared):
+        """A hundred megabytes in a hundred kilobytes, whatever size the archive gives them."""
+        n = 6_250_000
+        content = bytearray(
+            archive({"points1.npy": npy_header(f"({n}, 2)") + bytes(16 * n), "points2.npy": b""})
+        )
+        assert len(content) < 200_000
+        for signature, size in ((b"PK\x03\x04", 22), (b"PK\x01\x02", 24)):
+            struct.pack_into("<I", content, content.find(signature) + size, declared)
+        tracemalloc.start()
+        try:
+            message = self.refused(tmp_path, content)
+            peak = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        # The array itself is asked for before its numbers are seen, and never written to.
+        assert peak < 10_000_000 + (16 * n if declared == 1000 else 0)
+        assert ("more than the 10,000,000 matches" in message) == (declared > 1000)
+
+    def test_long_doubles_beyond_double_are_infinite(self, tmp_path):
+        points = np.full((12, 2), np.finfo(np.longdouble).max)
+        path = tmp_path / "matches.npz"
+        path.write_bytes(archive({"points1.npy": npy(points), "points2.npy": npy(X[:, 2:])}))
+        found, _ = read_matches(path)
+        assert (found[:, :2] > 1e308).all()
+        np.testing.assert_array_equal(found[:, 2:], X[:, 2:])
 
 
 class TestCsv:
@@ -163,8 +298,42 @@ class TestCsv:
     def test_not_text(self, tmp_path):
         path = tmp_path / "matches.csv"
         path.write_bytes(b"\xff\xfe\x00\x01" * 10)
-        with pytest.raises(InputError, match="not a text file"):
+        with pytest.raises(InputError, match=r"not a text file of .* in UTF-8"):
             read_matches(path)
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("1,2,3,4\n" + "1," * 500 + "x" * 500 + "\n", "line 2: 501 comma-separated columns"),
+            ("1,2,3," + "x" * 500 + "\n", "line 1: 'x+\\.\\.\\.' is not a number"),
+            ("x\x1b[31m" * 500, r"header 'x\?\[31mx.*\.\.\.' is not"),
+            ('1,2,"3\n3",4\n1,2,3,4\n', r"line 2: '3\?3' is not a number"),
+            ('1,2,3,4\n"1\n2\n', r"line 3: 1 comma-separated columns"),
+        ],
+    )
+    def test_what_the_file_says_is_shown_short_and_printable(self, tmp_path, text, message):
+        with pytest.raises(InputError, match=f"matches.csv: {message}") as refusal:
+            self.read(tmp_path, text)
+        assert str(refusal.value).isprintable()
+        assert len(str(refusal.value)) < len(str(tmp_path)) + 200
+
+    @pytest.mark.parametrize("unit", ["1,", "\0", '"1\n', "x"])
+    def test_a_line_without_end_is_not_read(self, tmp_path, unit):
+        path = tmp_path / "matches.csv"
+        path.write_text("1,2,3,4\n" + unit * (30_000_000 // len(unit)))
+        tracemalloc.start()
+        try:
+            with pytest.raises(InputError) as refusal:
+                read_matches(path)
+            assert tracemalloc.get_traced_memory()[1] < 3_000_000
+        finally:
+            tracemalloc.stop()
+        assert len(str(refusal.value)) < len(str(tmp_path)) + 200
+
+    @pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-32", "latin-1", "cp1252"])
+    def test_other_encodings_than_utf_8(self, tmp_path, encoding):
+        with pytest.raises(InputError, match=r"matches\.csv: (not a text file|header|line 1)"):
+            self.read(tmp_path, "x,y,x',y',\xe9\n1,2,3,4,5\n", encoding)
 
 
 def test_other_kinds_of_files_are_named(tmp_path):
