@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from numbers import Integral
 from typing import Literal
 
 import numpy as np
@@ -244,8 +245,8 @@ def density_peaks(
         raise ValueError(f"dc_percent is a percentage in (0, 100]; got {dc_percent}")
     if kernel not in ("cutoff", "gaussian"):
         raise ValueError(f"kernel must be 'cutoff' or 'gaussian'; got {kernel!r}")
-    if sample_size is not None and sample_size < 2:
-        raise ValueError(f"sample_size is a number of points, at least 2; got {sample_size}")
+    if sample_size is not None and not (isinstance(sample_size, Integral) and sample_size >= 2):
+        raise ValueError(f"sample_size is a number of points, at least 2; got {sample_size!r}")
 
     n = len(X)
     if dc is None:
