@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
@@ -15,6 +16,10 @@ from cv_densityf._engine import Robust, method_flag, method_name
 from cv_densityf._epipolar import inlier_mask
 from cv_densityf._prefilter import contrast_support, paper_support
 from cv_densityf._stopwatch import Stopwatch
+
+#: One line per estimate at level DEBUG.
+LOG = logging.getLogger("cv_densityf")
+LOG.addHandler(logging.NullHandler())
 
 Density = Literal["contrast", "paper", "off"]
 DENSITIES = get_args(Density)
@@ -100,6 +105,30 @@ def run(
     seed: int = 0,
 ) -> Estimate:
     """Estimate F from trusted arguments: X (n, 4) float64, whose rows may hold NaN or Inf."""
+    estimate = _estimate(X, robust, density, alpha, dc_percent, scores, seed)
+    if LOG.isEnabledFor(logging.DEBUG):
+        LOG.debug(
+            "%d matches, %d kept, %d draws, %d inliers, engine %s, %.1f ms: %s",
+            len(X),
+            np.count_nonzero(estimate.kept),
+            estimate.n_draws,
+            estimate.n_inliers,
+            estimate.engine,
+            sum(estimate.timings.values()),
+            estimate.reason,
+        )
+    return estimate
+
+
+def _estimate(
+    X: NDArray[np.float64],
+    robust: Robust,
+    density: str,
+    alpha: float,
+    dc_percent: float,
+    scores: NDArray[np.float64] | None,
+    seed: int,
+) -> Estimate:
     watch = Stopwatch()
     n = len(X)
     finite = finite_in_cv2(X)

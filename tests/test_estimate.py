@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import doctest
+import logging
 import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import FrozenInstanceError
@@ -13,7 +14,12 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from cv_densityf import Estimate, estimate_fundamental
+from cv_densityf import (
+    Estimate,
+    FundamentalMatrixEstimator,
+    estimate_fundamental,
+    findFundamentalMat,
+)
 from cv_densityf._engine import METHODS, Robust, original
 from cv_densityf._epipolar import inlier_mask, sampson_distance
 from cv_densityf._estimate import MIN_FILTERED, run
@@ -119,6 +125,43 @@ def test_arguments_are_left_as_they_are():
     np.testing.assert_array_equal(scene.points1, points[0])
     np.testing.assert_array_equal(scene.points2, points[1])
     np.testing.assert_array_equal(scores, kept)
+
+
+# What it tells a logger
+
+
+def test_one_line_per_call_for_whoever_listens(caplog):
+    X = scene_of().X
+    with caplog.at_level("DEBUG", "cv_densityf"):
+        found = estimate(X)
+        findFundamentalMat(X[:, :2], X[:, 2:], cv2.USAC_MAGSAC, 1.0, 0.999, 1000)
+        FundamentalMatrixEstimator(method="ransac").fit(X)
+        estimate(X[:12], method="ransac")
+    lines = [record.getMessage() for record in caplog.records]
+    assert {record.name for record in caplog.records} == {"cv_densityf"}
+    assert len(lines) == 4
+    head = f"400 matches, {found.kept.sum()} kept, {found.n_draws} draws, {found.n_inliers} inliers"
+    assert lines[0].startswith(f"{head}, engine density, ")
+    ms = float(re.search(r"([\d.]+) ms: ", lines[0])[1])
+    assert ms == pytest.approx(sum(found.timings.values()), abs=0.1)
+    assert lines[0].endswith(found.reason)
+    assert all(line.startswith("400 matches, ") for line in lines[1:3])
+    assert "12 kept, 0 draws" in lines[3]
+    assert "engine ransac" in lines[3]
+    assert "fewer than 15 finite matches" in lines[3]
+
+
+def test_nobody_listens_by_default(capfd, monkeypatch):
+    assert any(
+        isinstance(h, logging.NullHandler) for h in logging.getLogger("cv_densityf").handlers
+    )
+
+    def never(*_, **__):
+        raise AssertionError("made a record that nobody reads")
+
+    monkeypatch.setattr(logging.Logger, "makeRecord", never)
+    assert estimate(scene_of().X)
+    assert capfd.readouterr() == ("", "")
 
 
 # What it finds
