@@ -1,19 +1,31 @@
-"""The compat suite and the tests on the releases of OpenCV that people have.
+"""The releases of OpenCV that people have, the package as people get it, and its oldest versions.
 
-``nox`` runs the newest release of each line, ``nox -s compat tests`` the whole matrix, and
-``nox -s compat_table`` writes what came out into docs/compat.md.
+``nox`` runs the compat suite and the tests on the newest release of each line of OpenCV,
+``nox -s compat tests`` on the whole matrix, and ``nox -s compat_table`` writes what came out into
+docs/compat.md. Before a release also ``nox -s package lowest types``. Install ``nox[uv]`` for it;
+Pythons that are not there are skipped.
 """
 
 from __future__ import annotations
 
-from pathlib import Path
+import json
+import os
+import shutil
+import zipfile
+from itertools import chain
+from pathlib import Path, PurePosixPath
 
 import nox
+from packaging.requirements import Requirement
+from packaging.version import Version
 
 nox.options.tags = ["newest"]
 nox.options.reuse_venv = "yes"
 
+PROJECT = nox.project.load_toml("pyproject.toml")
+PYTHONS = nox.project.python_versions(PROJECT)
 OUTCOMES = Path(".nox") / "compat"
+TEST_TOOLS = ("hypothesis", "pytest", "pytest-timeout")
 
 #: Release of OpenCV, the numpy to run it with, Pythons. Wheels before 4.10 need numpy 1.
 MATRIX = [
@@ -45,19 +57,9 @@ def releases(*, pythons: slice = slice(None)):
     )
 
 
-def install(session: nox.Session, opencv: str, numpy: str, *others: str) -> None:
+def install(session: nox.Session, opencv: str, numpy: str) -> None:
     """Install the package beside exactly this OpenCV."""
-    session.install(
-        f"opencv-contrib-python-headless=={opencv}",
-        numpy,
-        "scipy>=1.11",
-        "scikit-learn>=1.6",
-        "pytest>=8.3",
-        "pytest-timeout>=2.3",
-        "hypothesis>=6.100",
-        *others,
-    )
-    session.install("--no-deps", ".")
+    session.install(f"opencv-contrib-python-headless=={opencv}", numpy, *TEST_TOOLS, ".")
 
 
 @nox.session
@@ -97,13 +99,7 @@ def tests(session: nox.Session, opencv: str, numpy: str) -> None:
 @nox.session
 def clients(session: nox.Session) -> None:
     """Run machinevision-toolbox-python, which brings its own OpenCV wheels, on both functions."""
-    session.install(
-        "machinevision-toolbox-python>=2.4",
-        "scikit-learn>=1.6",
-        "pytest>=8.3",
-        "pytest-timeout>=2.3",
-        "hypothesis>=6.100",
-    )
+    session.install("machinevision-toolbox-python>=2.4", "scikit-learn", *TEST_TOOLS)
     session.install("--no-deps", ".")
     for name in ("cv2:findFundamentalMat", "cv_densityf:findFundamentalMat"):
         session.run(
@@ -121,3 +117,105 @@ def compat_table(session: nox.Session) -> None:
     if not found:
         session.error("no outcomes yet; run `nox -s compat` first")
     session.run("python", "compat/table.py", "--into", "docs/compat.md", *found, external=True)
+
+
+@nox.session(python=PYTHONS)
+def package(session: nox.Session) -> None:
+    """Build, look inside, install each archive where nothing else is, run what arrived."""
+    session.install("build", "twine")
+    scratch = Path(session.create_tmp()).absolute()
+    shutil.rmtree(scratch)
+    scratch.mkdir()
+    session.run("python", "-m", "build", "--outdir", str(scratch / "dist"))
+    (wheel,) = (scratch / "dist").glob("*.whl")
+    (sdist,) = (scratch / "dist").glob("*.tar.gz")
+    session.run("twine", "check", "--strict", str(wheel), str(sdist))
+    shutil.unpack_archive(sdist, scratch)
+    unpacked = scratch / sdist.name.removesuffix(".tar.gz")
+    check_sdist(session, unpacked)
+    check_wheel(session, wheel)
+
+    smoke = str(Path("tests/smoke.py").absolute())
+    for archive in (wheel, sdist):
+        environment = scratch / f"installed-{archive.suffix[1:]}"
+        session.run("python", "-m", "venv", str(environment))
+        bin_ = environment / ("Scripts" if os.name == "nt" else "bin")
+        with session.chdir(scratch):
+            for extra in ("", "[demo]"):
+                session.run(
+                    *(str(bin_ / "python"), "-m", "pip", "install", "--quiet"),
+                    f"cv-densityf{extra} @ {archive.absolute().as_uri()}",
+                    external=True,
+                )
+                session.run(str(bin_ / "python"), "-I", smoke, external=True)
+                session.run(str(bin_ / "cv-densityf"), "version", external=True)
+            session.run(str(bin_ / "cv-densityf"), "demo", external=True)
+
+    session.install(f"{unpacked}[test]")
+    with session.chdir(unpacked):
+        session.run("python", "-m", "pytest", "-q", *session.posargs)
+
+
+def check_sdist(session: nox.Session, unpacked: Path) -> None:
+    """Refuse to pack less or more than the repository."""
+    packed = {path.relative_to(unpacked) for path in unpacked.rglob("*") if path.is_file()}
+    listed = session.run("git", "ls-files", external=True, silent=True)
+    tracked = {Path(line) for line in str(listed).splitlines()}
+    compare(session, "the sdist", packed, tracked | {Path("PKG-INFO")})
+
+
+def check_wheel(session: nox.Session, wheel: Path) -> None:
+    """Refuse to pack less or more than the modules of the package."""
+    folder, _ = wheel.name.split("-py3-", 1)
+    info = PurePosixPath(f"{folder}.dist-info")
+    with zipfile.ZipFile(wheel) as archive:
+        packed = {PurePosixPath(name) for name in archive.namelist()}
+    modules = {PurePosixPath(path.as_posix()) for path in Path("cv_densityf").glob("*.py")}
+    about = ("METADATA", "RECORD", "WHEEL", "entry_points.txt", "licenses/LICENSE")
+    wanted = {*modules, PurePosixPath("cv_densityf/py.typed"), *(info / name for name in about)}
+    compare(session, "the wheel", packed, wanted)
+
+
+def compare(session: nox.Session, name: str, packed: set, wanted: set) -> None:
+    """End the session unless both are equal."""
+    for what, paths in (("lacks", wanted - packed), ("should not hold", packed - wanted)):
+        if paths:
+            session.error(f"{name} {what} {', '.join(sorted(map(str, paths)))}")
+
+
+@nox.session(python=PYTHONS[0], venv_backend="uv")
+def lowest(session: nox.Session) -> None:
+    """Run all tests on the lowest versions that pyproject.toml allows."""
+    extras = sorted(PROJECT["project"]["optional-dependencies"].keys() - {"docs"})
+    session.install(
+        *("--resolution=lowest-direct", "--upgrade", "--reinstall-package=cv-densityf"),
+        f".[{','.join(extras)}]",
+    )
+    check_floors(session, extras)
+    session.run("python", "-m", "pytest", "-q", *session.posargs)
+    session.run("python", "-m", "pytest", "-q", "compat", *session.posargs)
+
+
+def check_floors(session: nox.Session, extras: list[str]) -> None:
+    """Refuse floors that are not what is installed: nobody would have run the tests on them."""
+    listed = session.run("uv", "pip", "list", "--format=json", silent=True)
+    installed = {item["name"]: Version(item["version"]) for item in json.loads(str(listed))}
+    project = PROJECT["project"]
+    groups = [project["dependencies"], *(project["optional-dependencies"][e] for e in extras)]
+    for requirement in map(Requirement, chain(*groups)):
+        if requirement.name == project["name"]:
+            continue
+        if requirement.marker and not requirement.marker.evaluate():
+            continue
+        (floor,) = requirement.specifier
+        if installed[requirement.name] != Version(floor.version):
+            found = installed[requirement.name]
+            session.error(f"{requirement}: the lowest that goes with the others is {found}")
+
+
+@nox.session(python=PYTHONS[0])
+def types(session: nox.Session) -> None:
+    """Check the package with both type checkers, in their strictest and standard modes."""
+    session.install(".[test]", "pyright")
+    session.run("mypy", "--strict", "cv_densityf")
+    session.run("pyright")
