@@ -102,7 +102,7 @@ class DensityPeaks(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         Points on the rim of their cluster, no denser than its border to another.
     n_features_in_ : int
         Number of columns seen in fit.
-    feature_names_in_ : ndarray of str, shape (n_features_in_,)
+    feature_names_in_ : ndarray of str, shape (n_features,)
         Names of the columns, where X had string names.
 
     See Also
@@ -232,7 +232,7 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
         Indices of the rows kept.
     n_features_in_ : int
         Number of columns seen in fit.
-    feature_names_in_ : ndarray of str, shape (n_features_in_,)
+    feature_names_in_ : ndarray of str, shape (n_features,)
         Names of the columns, where X had string names.
 
     See Also

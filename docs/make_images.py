@@ -1,10 +1,12 @@
-"""Draw the pictures of how-it-works.md: ``python docs/make_how_images.py [folder]``."""
+"""Draw the pictures that come from no benchmark: ``python docs/make_images.py [folder]``."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import cv2
 import matplotlib as mpl
@@ -18,6 +20,7 @@ from cv_densityf._epipolar import sampson_distance
 from cv_densityf._prefilter import N_NEIGHBORS, contrast_reliability
 from cv_densityf.datasets import motorcycle
 from cv_densityf.matching import match_images
+from cv_densityf.plotting import plot_decision_graph, plot_epipolar_lines, plot_matches
 
 BLUE, ORANGE, RED, DARK = "#0072B2", "#E69F00", "#D55E00", "#333333"
 #: A match is taken for right when it is this near to the known epipolar geometry, pixels.
@@ -37,7 +40,15 @@ def main(folder: Path) -> None:
         f"{estimate.reason}, error {pair.error(estimate.F):.2f} px"
     )
     mpl.rcParams.update({"font.size": 11, "axes.titlesize": 12})
+    photographs = (pair.image1, pair.image2, X)
     pictures = {
+        "matches": page_wide(4.1, plot_matches, *photographs, estimate.kept, estimate.mask),
+        "epipolar_lines": page_wide(
+            3.8, plot_epipolar_lines, *photographs, estimate.F, estimate.mask
+        ),
+        "decision_graph": page_wide(
+            5, plot_decision_graph, density_peaks(X), kept=estimate.kept, mask=estimate.mask
+        ),
         "how-neighbours": neighbours(greys, X, right),
         "how-contrast": contrast(greys[0], X, right),
         "how-vote": vote(greys[0], X[estimate.mask]),
@@ -47,8 +58,23 @@ def main(folder: Path) -> None:
     for name, figure in pictures.items():
         raw = BytesIO()
         figure.savefig(raw, dpi=100)
-        small = Image.open(raw).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE)
+        small = Image.open(raw).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT)
         small.save(folder / f"{name}.png", optimize=True)
+
+
+def page_wide(
+    height: float, plot: Callable[..., plt.Axes], *args: Any, **kwargs: Any
+) -> plt.Figure:
+    """Draw one of the package's plots in the width of a page, so that its letters can be read."""
+    figure, ax = plt.subplots(figsize=(10, height), layout="constrained")
+    plot(*args, **kwargs, ax=ax)
+    if ax.get_legend() is not None:
+        columns = 4 if len(ax.get_legend().legend_handles) == 4 else 3
+        ax.legend(
+            loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, frameon=False,
+            markerscale=1.4, columnspacing=1.2,
+        )  # fmt: skip
+    return figure
 
 
 def show(ax: plt.Axes, image: np.ndarray, title: str) -> None:

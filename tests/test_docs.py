@@ -1,0 +1,60 @@
+"""The pages: their examples run, and their links lead somewhere, with and without Sphinx."""
+
+from __future__ import annotations
+
+import doctest
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+FENCE = re.compile(r"^```(\w*)")
+
+
+def code_lines(text: str, language: str | None) -> str:
+    """The lines inside fences of one language, or outside of all fences; blank lines elsewhere."""
+    lines, inside = [], None
+    for line in text.splitlines():
+        fence = FENCE.match(line)
+        if fence:
+            inside = None if inside is not None else fence[1]
+        lines.append("" if fence or inside != language else line)
+    return "\n".join(lines) + "\n"
+
+
+def slugs(text: str) -> set[str]:
+    """Anchors of the headings, as Markdown hosts and MyST make them."""
+    headings = re.findall(r"^#+ (.+)$", code_lines(text, None), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+WITH_EXAMPLES = [page for page in PAGES if ">>> " in page.read_text("utf-8")]
+
+
+@pytest.mark.parametrize("page", WITH_EXAMPLES, ids=lambda page: page.name)
+def test_examples_run(page):
+    code = code_lines(page.read_text("utf-8"), "python")
+    test = doctest.DocTestParser().get_doctest(code, {}, page.name, str(page), 0)
+    assert len(test.examples) == page.read_text("utf-8").count("\n>>> ")
+    report: list[str] = []
+    flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+    doctest.DocTestRunner(optionflags=flags).run(test, out=report.append)
+    assert not report, "".join(report)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    text = code_lines(page.read_text("utf-8"), None)
+    links = re.findall(r"\]\(([^)\s]+)\)", text)
+    names = set(re.findall(r"\[([^\]]+)\]\[\]", text))
+    assert names <= set(re.findall(r"^\[([^\]]+)\]: ", text, re.MULTILINE))
+    for link in links:
+        if link.startswith(("http://", "https://")):
+            continue
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        assert target.is_file(), f"{link}: no such file"
+        if anchor:
+            assert anchor in slugs(target.read_text("utf-8")), f"{link}: no such heading"
