@@ -287,23 +287,23 @@ def _stage(name: str, timings: dict[str, float]) -> Iterator[None]:
 
 
 @contextmanager
-def _own_words() -> Iterator[None]:
-    """Hold back what image decoders print on their own: they do where we are about to say it."""
+def _held_back() -> Iterator[list[str]]:
+    """Hold back what image decoders print on their own, next to what we are about to say."""
+    words: list[str] = []
     try:
         terminal = os.dup(2)
     except OSError:  # there is no standard error
-        yield
+        yield words
         return
     with tempfile.TemporaryFile() as said:
         os.dup2(said.fileno(), 2)
         try:
-            yield
+            yield words
         finally:
             os.dup2(terminal, 2)
             os.close(terminal)
-        # The image was read in spite of it: a damaged JPEG file, say.
         said.seek(0)
-        os.write(2, said.read())
+        words.append(said.read().decode(errors="replace"))
 
 
 def _run_match(options: argparse.Namespace) -> int:
@@ -322,12 +322,13 @@ def _run_match(options: argparse.Namespace) -> int:
 
     timings: dict[str, float] = {}
     images: tuple[NDArray[Any] | None, NDArray[Any] | None] = (None, None)
+    words: list[str] = []
     scores: Floats | None
     if options.points is not None:
         with _stage("reading", timings):
             X, scores = read_matches(options.points)
     else:
-        with _stage("reading", timings), _own_words():
+        with _stage("reading", timings), _held_back() as words:
             images = (read_image(options.images[0]), read_image(options.images[1]))
         limits = {
             "max_size": options.max_size or MAX_SIZE,
@@ -380,6 +381,8 @@ def _run_match(options: argparse.Namespace) -> int:
     if options.plot is not None:
         with _stage("drawing", timings):
             _draw(options.plot, images, X, estimate, options.alpha)
+    # Such as that a JPEG file is damaged, but was of use.
+    sys.stderr.writelines(words)
     return FOUND
 
 
