@@ -305,7 +305,7 @@ def estimate_fundamental(
 
     References
     ----------
-    H. Wu and Y. Wan, "Clustering assisted fundamental matrix estimation" (2015).
+    Hao Wu and Yi Wan, "Clustering assisted fundamental matrix estimation" (2015).
 
     Examples
     --------

@@ -55,7 +55,7 @@ def epipolar_distance(
 
     References
     ----------
-    Z. Zhang, "Determining the epipolar geometry and its uncertainty: a review", IJCV 1998.
+    Zhengyou Zhang, "Determining the epipolar geometry and its uncertainty: a review", IJCV 1998.
 
     Examples
     --------

@@ -213,7 +213,7 @@ def findFundamentalMat(
 
     References
     ----------
-    .. [1] H. Wu and Y. Wan, "Clustering assisted fundamental matrix estimation", 2015.
+    .. [1] Hao Wu and Yi Wan, "Clustering assisted fundamental matrix estimation", 2015.
 
     Examples
     --------

@@ -249,7 +249,7 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
 
     References
     ----------
-    H. Wu and Y. Wan, "Clustering assisted fundamental matrix estimation" (2015), section 2.6.
+    Hao Wu and Yi Wan, "Clustering assisted fundamental matrix estimation" (2015), section 2.6.
 
     Examples
     --------
@@ -434,7 +434,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         Largest distance of an inlier, in pixels: ``threshold``, or what "lmeds" derived from the
         rows of fit.
     n_features_in_ : int
-        4.
+        Always 4.
     feature_names_in_ : ndarray of str, shape (4,)
         Names of the columns, where X had string names.
 

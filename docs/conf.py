@@ -27,6 +27,7 @@ nitpicky = True
 default_role = "py:obj"  # the single backticks of the docstrings
 nitpick_ignore_regex = [("py:obj", r"(joblib|numpy|sklearn)\..*")]  # other people's pages
 templates_path = ["_templates"]
+smartquotes = False  # x' is no quotation
 
 myst_heading_anchors = 3
 copybutton_exclude = ".linenos, .gp, .go"
@@ -43,9 +44,11 @@ sphinx_gallery_conf = {
     "backreferences_dir": "gallery/backreferences",
     "within_subsection_order": "FileNameSortKey",
     "download_all_examples": False,
+    "remove_config_comments": True,
     "show_memory": False,
     "show_signature": False,
     "capture_repr": ("_repr_html_", "__repr__"),
+    "ignore_repr_types": "matplotlib",
     "write_computation_times": False,
 }
 

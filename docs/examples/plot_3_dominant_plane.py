@@ -3,8 +3,8 @@ When one plane out-votes the scene
 ==================================
 
 A facade, a floor, a poster: if nearly all right matches lie on one plane, a fundamental matrix can
-have hundreds of inliers and still be wrong everywhere else, for every matrix that maps the plane
-rightly explains them. Counting inliers cannot tell; looking where they are can.
+have hundreds of inliers and still be wrong everywhere else, because every matrix that is right on
+the plane explains them. Counting inliers cannot tell; looking where they are can.
 """
 
 # %%

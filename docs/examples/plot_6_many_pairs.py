@@ -45,8 +45,8 @@ by_chance = [estimate.n_inliers for estimate in estimate_many(shuffled)]
 print("inliers by chance:", sorted(by_chance))
 
 # %%
-# Results with no more inliers than that mean nothing, and the truth, known here, agrees. With twice
-# as many they are right, or nearly.
+# Results with no more inliers than that mean nothing, and the truth, known here, agrees. With three
+# times as many they are right, or nearly.
 
 n_inliers = [estimate.n_inliers for estimate in estimates[:80]]
 distances = [

@@ -76,4 +76,5 @@ estimate = cv_densityf.estimate_fundamental(points1, points2)
 print(estimate.reason)
 
 fig, ax = plt.subplots(figsize=(12, 4.6), layout="constrained")
-_ = plot_matches(pair.image1, pair.image2, matches.X, estimate.kept, estimate.mask, ax=ax)
+plot_matches(pair.image1, pair.image2, matches.X, estimate.kept, estimate.mask, ax=ax)
+# sphinx_gallery_thumbnail_number = 2

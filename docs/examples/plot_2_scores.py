@@ -91,3 +91,4 @@ axes[0].set(yticks=range(len(ways)), yticklabels=ways, ylim=(len(ways) - 0.5, -0
 # probability. In cv2's call it is one more keyword,
 # ``findFundamentalMat(points1, points2, method, 1.0, 0.999, 5000, scores=scores)``; the estimators
 # take it as ``fit(X, sample_weight=scores)``.
+# sphinx_gallery_thumbnail_number = 2
