@@ -1,4 +1,4 @@
-"""``python -m benchmarks real | synthetic | stages | scale | paper``."""
+"""``python -m benchmarks real | synthetic | stages | scale | paper | reliability``."""
 
 from __future__ import annotations
 
@@ -103,6 +103,21 @@ def _parser() -> argparse.ArgumentParser:
         "--seeds", type=int, default=5, metavar="N", help="draws of each pair's matches (default 5)"
     )
     paper.set_defaults(run=_paper)
+
+    reliability = commands.add_parser(
+        "reliability", help="random calls beside cv2, load, memory, odd coordinates"
+    )
+    for name, default, about in (
+        ("--calls", 10_000, "random calls beside cv2"),
+        ("--seconds", 60, "of load from threads and processes"),
+        ("--repeats", 20_000, "calls over which memory is watched"),
+        ("--scenes", 20, "for each change of the coordinates"),
+        ("--seed", 0, "of the random calls"),
+    ):
+        reliability.add_argument(
+            name, type=int, default=default, metavar="N", help=f"{about} (default %(default)s)"
+        )
+    reliability.set_defaults(run=_reliability)
     return parser
 
 
@@ -198,6 +213,14 @@ def _scale(args: argparse.Namespace) -> int:
 
 def _paper(args: argparse.Namespace) -> int:
     print(reproduce(args.data, args.out, args.seeds, args.quick))
+    return 0
+
+
+def _reliability(args: argparse.Namespace) -> int:
+    # The cases of the compat suite are made when it is imported.
+    from benchmarks.reliability import reliability
+
+    print(reliability(args.calls, args.seconds, args.repeats, args.scenes, args.seed))
     return 0
 
 

@@ -509,7 +509,7 @@ CALLS: list[int] = []
 def in_a_process(name):
     warnings.simplefilter("error")
     # Said to the caller, and no fault: too few rows for a filter, and numpy on complex numbers.
-    warnings.filterwarnings("ignore", category=UserWarning, module="cv_densityf.estimators")
+    warnings.filterwarnings("ignore", ".* rows would be left", UserWarning)
     warnings.filterwarnings("ignore", category=np.exceptions.ComplexWarning)
     warnings.filterwarnings("ignore", category=HypothesisWarning)
     if sys.platform == "linux":
