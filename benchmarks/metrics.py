@@ -9,6 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.integrate import trapezoid
 
 Floats = NDArray[np.float64]
 
@@ -134,7 +135,7 @@ def pose_auc(errors: Sequence[float] | Floats, limit: float) -> float:
     below = e[e < limit]
     x = np.concatenate([[0.0], below, [limit]])
     y = np.concatenate([[0.0], np.arange(1, len(below) + 1) / n, [len(below) / n]])
-    return float(np.trapezoid(y, x) / limit)
+    return float(trapezoid(y, x) / limit)
 
 
 def summarise(

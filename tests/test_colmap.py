@@ -23,6 +23,7 @@ from cv_densityf.datasets import two_view_scene
 pycolmap = pytest.importorskip("pycolmap")
 
 SURPLUS = 5
+UNDEFINED = int(pycolmap.TwoViewGeometryConfiguration.UNDEFINED)
 
 
 def make_database(path, n_pairs, n=300, junk=()):
@@ -110,7 +111,8 @@ def test_close_to_colmaps_own_verification(database, made, tmp_path):
     for own, other in zip(rows(database), rows(theirs), strict=True):
         assert own[0] == other[0]
         assert own[4] in (DEGENERATE, UNCALIBRATED)
-        assert (own[4] == DEGENERATE) == (other[4] == DEGENERATE)
+        # COLMAP before 4.2 leaves pairs with few inliers undefined.
+        assert (own[4] == DEGENERATE) == (other[4] in (UNDEFINED, DEGENERATE))
         a, b = (set(np.frombuffer(row[3] or b"", dtype=np.uint64).tolist()) for row in (own, other))
         assert len(a & b) >= 0.9 * len(a | b)
 

@@ -83,7 +83,7 @@ assert_type(estimate.F, NDArray[np.float64] | None)
 assert_type(estimate.mask, NDArray[np.bool_])
 estimate.F.sum()  # refused: union-attr
 estimate.F = None  # refused: misc
-cv_densityf.estimate_fundamental(points, points, "lmeds", 1.0)  # refused: call-arg
+cv_densityf.estimate_fundamental(points, points, treshold=1.0)  # refused: call-arg
 cv_densityf.estimate_fundamental(points, points, density="dense")  # refused: arg-type
 
 assert_type(cv_densityf.estimate_many([(points, points)]), Iterator[cv_densityf.Estimate])
@@ -141,9 +141,12 @@ def answers(folder):
         types = [text for _, text in said[line] if text.startswith("Revealed type")]
         return errors or types[-1]
 
-    return {
+    found = {
         call: tuple(answer(first + 2 * i + k) for k in range(2)) for i, call in enumerate(CALLS)
     }
+    if "tuple[Any, Any]" in found["points, points"][0]:
+        pytest.skip("this cv2's stub knows no arrays")
+    return found
 
 
 @pytest.mark.parametrize("call", CALLS)
