@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import sys
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence, Sized
-from concurrent.futures import BrokenExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
+from concurrent.futures import BrokenExecutor, Future
 from contextlib import contextmanager
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -62,8 +63,9 @@ def estimate_many(
     -----
     When a worker process dies (``"loky"``), the pairs that were unfinished then are estimated one
     by one, each in a new process, which tells whose fault it was. ``"threading"`` and one job have
-    no worker to lose. On ``"dask"`` the scheduler gives the pairs of a dead worker to others; of a
-    pair that kills every worker it is given to, joblib 1.6 never hears again and waits.
+    no worker to lose. On ``"dask"`` the scheduler gives the pairs of a dead worker to others; when
+    it gives up (``distributed.scheduler.allowed-failures``), the unfinished pairs are estimated one
+    by one in processes on the machine that asks.
 
     Examples
     --------
@@ -126,8 +128,43 @@ def _parallel(
     from joblib import Parallel, delayed
 
     run = Parallel(n_jobs=n_jobs, backend=backend, return_as="generator")
+    # Whoever takes the first results and leaves knows what is lost.
+    run._warn_exit_early = lambda: None
+    if type(run._backend).__name__ == "DaskDistributedBackend":
+        run._backend = _with_losses_told(run._backend)
     estimates: Iterator[Estimate] = run(delayed(_one)(pair, options) for pair in pairs)
     return estimates
+
+
+def _with_losses_told(backend: Any) -> Any:
+    """Give a copy of joblib's dask backend that tells of tasks the scheduler has given up.
+
+    As of joblib 1.6 nobody is called back for them, so that whoever waits for the result waits for
+    ever.
+    """
+    from distributed.scheduler import KilledWorker
+
+    class Telling(type(backend)):  # type: ignore[misc]
+        def submit(self, func: Any, callback: Callable[[Any], None]) -> Future[Any]:
+            def tell(done: Future[Any]) -> None:
+                if done.exception() is not None:
+                    callback(done)
+
+            future: Future[Any] = super().submit(func, callback)
+            future.add_done_callback(tell)
+            return future
+
+        def retrieve_result_callback(self, out: Any) -> Any:
+            if not isinstance(out, Future):
+                return super().retrieve_result_callback(out)
+            try:
+                return out.result()
+            except KilledWorker as error:
+                raise BrokenExecutor(str(error)) from None
+
+    telling = copy(backend)
+    telling.__class__ = Telling
+    return telling
 
 
 def _one(pair: Pair, options: dict[str, Any]) -> Estimate:

@@ -150,6 +150,14 @@ def test_pairs_are_read_a_little_ahead_only(pairs):
     estimates.close()
 
 
+@pytest.mark.parametrize("n_jobs", [1, 2])
+def test_leaving_early_is_no_reason_to_warn(pairs, n_jobs):
+    estimates = estimate_many(pairs * 5, n_jobs=n_jobs)
+    assert next(estimates)
+    estimates.close()
+    assert len(list(estimate_many(pairs, n_jobs=n_jobs))) == len(pairs)
+
+
 def test_nothing_in_nothing_out():
     assert list(estimate_many([])) == []
 
@@ -193,6 +201,22 @@ def test_a_dask_cluster_takes_it_unchanged(pairs):
         tasks = client.run(lambda dask_worker: dask_worker.state.executed_count)
     assert sum(tasks.values()) >= len(pairs) / 2
     assert all(map(same, found, (estimate_fundamental(*pair) for pair in pairs)))
+
+
+@pytest.mark.filterwarnings("default")
+def test_dask_gives_up_on_a_pair_and_the_rest_goes_on(pairs):
+    distributed = pytest.importorskip("distributed")
+    dask = pytest.importorskip("dask")
+    mixed = [pairs[0], (Deadly(), pairs[1][1]), *pairs[2:]]
+    with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
+        cluster = distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+        )
+        with cluster, distributed.Client(cluster), joblib.parallel_config(backend="dask"):
+            found = list(estimate_many(mixed))
+    assert [bool(estimate) for estimate in found] == [True, False, *[True] * len(pairs[2:])]
+    assert "worker process died" in found[1].reason
+    assert same(found[-1], estimate_fundamental(*pairs[-1]))
 
 
 class Terminal:
