@@ -84,11 +84,12 @@ for ax, share in zip(axes, shares, strict=True):
     ax.set(title=f"one in {1 / share:.0f} is right", xscale="log", xlabel="mean error, pixels")
     ax.xaxis.set_major_formatter("{x:g}")
     ax.spines[["top", "right"]].set_visible(False)
-axes[0].set(yticks=range(len(ways)), yticklabels=ways, ylim=(len(ways) - 0.5, -0.5))
+axes[0].set(yticks=range(len(ways)), yticklabels=ways, ylim=(-0.5, len(ways) - 0.5))
+axes[0].invert_yaxis()
+# sphinx_gallery_thumbnail_number = 2
 
 # %%
 # Only the order of the scores counts, so any monotonic rating will do, and it need not be a
 # probability. In cv2's call it is one more keyword,
 # ``findFundamentalMat(points1, points2, method, 1.0, 0.999, 5000, scores=scores)``; the estimators
 # take it as ``fit(X, sample_weight=scores)``.
-# sphinx_gallery_thumbnail_number = 2

@@ -29,11 +29,9 @@ clusters = DensityPeaks(n_clusters=3, kernel="gaussian").fit(X)
 
 fig, (left, right) = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained")
 colors = np.array(["#0072B2", "#E69F00", "#009E73"])[clusters.labels_]
-halo = clusters.halo_mask_
-left.scatter(*X[~halo].T, s=16, color=colors[~halo])
-left.scatter(*X[halo].T, s=16, facecolors="none", edgecolors=colors[halo])
+left.scatter(*X.T, s=16, color=colors)
 left.plot(*X[clusters.cluster_centers_indices_].T, "k*", ms=13, mec="white")
-left.set(aspect="equal", title="three clusters and their centres; hollow: halo")
+left.set(aspect="equal", title="three clusters and their centres")
 DecisionGraphDisplay.from_estimator(clusters, ax=right)
 right.set_title("the decision graph")
 
@@ -41,7 +39,7 @@ right.set_title("the decision graph")
 # A match of two images is a point (x, y, x', y') in four dimensions, so it has a place in such a
 # graph, too. Here the truth is known, and tells the right matches (circles, triangles) from the
 # wrong ones. Most wrong ones are alone. The dashed line is the rule of Wu and Wan's paper, to keep
-# what lies above it: few wrong matches, but few of the right ones either. That is why this package
+# what lies on it or above: fewer wrong matches, but fewer right ones, too. That is why this package
 # does not delete what is below, and asks another question about density by default: see
 # :doc:`/how-it-works`.
 
