@@ -133,7 +133,7 @@ CALLS = [
             Method.RANSAC,
             np.int8(8),
             np.uint64(8),
-            np.timedelta64(8),
+            np.timedelta64(8, "s"),
         )
     ),
     *(
