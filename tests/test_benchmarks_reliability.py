@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import sys
 from itertools import count
 
@@ -126,7 +127,13 @@ def test_load_of_processes(monkeypatch):
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_leak_shows(monkeypatch):
     kept = []
-    monkeypatch.setattr(reliability, "_jobs", lambda: [lambda: kept.append(np.ones(100_000))])
+
+    def leak():
+        # Of the system itself: an array might go where earlier tests have left room.
+        kept.append(mmap.mmap(-1, 800_000))
+        kept[-1].write(b"1" * 800_000)
+
+    monkeypatch.setattr(reliability, "_jobs", lambda: [leak])
     marks = [float(mb) for mb in table(reliability.memory(100))["memory of the process, MB"]]
     assert len(marks) == 6
     # 800 kB for each call after the fifth.
