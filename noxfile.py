@@ -220,4 +220,4 @@ def types(session: nox.Session) -> None:
     """Check the package with both type checkers, in their strictest and standard modes."""
     session.install(".[test]", "pyright")
     session.run("mypy", "--strict", "cv_densityf")
-    session.run("pyright")
+    session.run("pyright", "--project", "pyproject.toml")

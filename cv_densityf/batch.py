@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from concurrent.futures import BrokenExecutor, Future
 from contextlib import contextmanager
 from copy import copy
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -240,13 +241,10 @@ def progress_bar(total: int | None, shown: bool | None = None) -> Iterator[Any]:
     """
     if shown is None:
         shown = sys.stderr is not None and sys.stderr.isatty()
-    if shown:
-        try:
-            from tqdm import tqdm
-        except ImportError:
-            shown = False
-    if not shown:
+    if shown and find_spec("tqdm") is not None:
+        from tqdm import tqdm
+
+        with tqdm(total=total, unit="pair", file=sys.stderr) as bar:
+            yield bar.update
+    else:
         yield lambda n=1: None
-        return
-    with tqdm(total=total, unit="pair", file=sys.stderr) as bar:
-        yield bar.update
