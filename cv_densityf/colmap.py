@@ -1,7 +1,7 @@
 """Verify the matches of a COLMAP database, in place of COLMAP's own geometric verification.
 
-Python's SQLite reads and writes the database, without pycolmap: that brings a second SQLite, and
-two of them on one file in one process void each other's locks.
+Python's SQLite reads and writes the database. ``pycolmap.Database`` (4.2) changes a file by opening
+it, does not wait for locks, and commits what an exception has interrupted.
 """
 
 from __future__ import annotations
