@@ -170,7 +170,7 @@ def check_wheel(session: nox.Session, wheel: Path) -> None:
     info = PurePosixPath(f"{folder}.dist-info")
     with zipfile.ZipFile(wheel) as archive:
         packed = {PurePosixPath(name) for name in archive.namelist()}
-    modules = {PurePosixPath(path.as_posix()) for path in Path("cv_densityf").glob("*.py")}
+    modules = {PurePosixPath(path.as_posix()) for path in Path("cv_densityf").rglob("*.py")}
     about = ("METADATA", "RECORD", "WHEEL", "entry_points.txt", "licenses/LICENSE")
     wanted = {*modules, PurePosixPath("cv_densityf/py.typed"), *(info / name for name in about)}
     compare(session, "the wheel", packed, wanted)
