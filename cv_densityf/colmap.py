@@ -182,7 +182,11 @@ def _open(path: Path, *, write: bool) -> Iterator[sqlite3.Connection]:
         raise InputError(f"{path}: a folder; give the database file in it")
     if write and not (os.access(path, os.W_OK) and path.stat().st_mode & 0o222):
         raise InputError(f"{path}: read-only; make it writable, or ask for a dry run")
-    url = f"file:{pathname2url(str(path.absolute()))}?mode={'rw' if write else 'ro'}"
+    # COLMAP's write-ahead log: who may only read would leave an empty one behind, and who may write
+    # would put into the database what a killed program has left in it.
+    logged = path.with_name(f"{path.name}-wal").exists()
+    mode = "rw" if write or not logged else "ro"
+    url = f"file:{pathname2url(str(path.absolute()))}?mode={mode}"
     try:
         # Transactions are begun by hand: the module's own begin later than the lock must.
         with closing(
@@ -192,6 +196,8 @@ def _open(path: Path, *, write: bool) -> Iterator[sqlite3.Connection]:
                 # A lock is found now, not after an hour's work.
                 connection.execute("BEGIN IMMEDIATE")
                 connection.execute("ROLLBACK")
+            else:
+                connection.execute("PRAGMA query_only = ON")
             yield connection
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
