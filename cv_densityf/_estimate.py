@@ -26,10 +26,13 @@ DENSITIES = get_args(Density)
 
 #: With fewer matches cv2 turns RANSAC into LMEDS, and there is no density to speak of.
 MIN_FILTERED = 15
-#: More matches than this do not help to find F: the search runs on a seeded subset of this size.
+#: More matches than this do not help to find F: a seeded, well spread part of this size searches.
 MAX_SEARCHED = 5_000
 #: They do help to refine it, up to what memory should bear.
 MAX_REFINED = 100_000
+#: A part is spread over cells of the first image, and in each of them over cells of the second:
+#: this many to the longer side.
+_CELLS = (16, 8)
 #: For LMEDS, which has no threshold: this part of the points' spread, some 3 px in a photograph.
 _LMEDS_THRESHOLD = 0.01
 #: An F that explains fewer matches than a minimal sample is none.
@@ -139,10 +142,11 @@ def _estimate(
         if len(rows) < MIN_FILTERED:
             why = f"fewer than {MIN_FILTERED} finite matches"
         return _plain(X, finite, robust, watch, f"cv2's own call, since {why}")
-    others = rows[:0]
+    heard = rows
     if len(rows) > MAX_SEARCHED:
-        shuffled = np.random.default_rng(abs(seed)).permutation(rows)
-        rows, others = np.sort(shuffled[:MAX_SEARCHED]), shuffled[MAX_SEARCHED:MAX_REFINED]
+        rng = np.random.default_rng(abs(seed))
+        heard = rows[_spread(X[rows], MAX_REFINED, rng)]
+        rows = heard[_spread(X[heard], MAX_SEARCHED, rng)]
     Z = X[rows] if len(rows) < n else X
     if _on_a_line(Z[:, :2]) or _on_a_line(Z[:, 2:]):
         return _plain(X, finite, robust, watch, "cv2's own call, since all points are on a line")
@@ -174,10 +178,9 @@ def _estimate(
                 if trust is None and robust.best_first:
                     trust = -rows.astype(np.float64)
                 found = search(Z, r, watch=watch, scores=trust, **asked)
-                if found is not None and len(others):
-                    whole = np.concatenate([Z, X[others]])
-                    F = refine(found.F, whole, np.flatnonzero(support), threshold)
-                    found = replace(found, F=F)
+                if found is not None and len(heard) > len(rows):
+                    reliable = heard.searchsorted(rows[support])
+                    found = replace(found, F=refine(found.F, X[heard], reliable, threshold))
                     watch.lap("polish")
         except np.linalg.LinAlgError:
             found = None
@@ -202,6 +205,30 @@ def _estimate(
         timings=watch.laps,
         votes=found.votes,
     )
+
+
+def _spread(X: NDArray[np.float64], size: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Draw ``size`` rows that lie in both images as all do, in rising order; all of fewer.
+
+    The rows are lined up cell by cell, neighbours next to each other, and cut into ``size`` runs of
+    equal length; one of each is drawn.
+    """
+    if len(X) <= size:
+        return np.arange(len(X))
+    first, second = _CELLS
+    cell = _winding(X[:, :2], first) * second**2 + _winding(X[:, 2:], second)
+    order = np.argsort(cell.astype(np.uint16), kind="stable")
+    edges = np.arange(size + 1) * len(X) // size
+    places = edges[:-1] + (rng.random(size) * np.diff(edges)).astype(np.intp)
+    return np.sort(order[places])
+
+
+def _winding(points: NDArray[np.float64], side: int) -> NDArray[np.intp]:
+    """Give each point the number of its cell on a path up and down the columns of a grid."""
+    low = points.min(axis=0)
+    width = max(float((points.max(axis=0) - low).max()), 1e-300) / side
+    column, row = np.minimum((points - low) / width, side - 1).astype(np.intp).T
+    return np.asarray(column * side + np.where(column % 2 == 1, side - 1 - row, row))
 
 
 def finite_in_cv2(X: NDArray[np.floating]) -> NDArray[np.bool_]:

@@ -22,7 +22,7 @@ from cv_densityf import (
 )
 from cv_densityf._engine import METHODS, Robust, original
 from cv_densityf._epipolar import inlier_mask, sampson_distance
-from cv_densityf._estimate import MIN_FILTERED, run
+from cv_densityf._estimate import _CELLS, MIN_FILTERED, _spread, run
 from cv_densityf.datasets import two_view_scene
 
 ROBUST = [name for name in METHODS if name not in ("7point", "8point")]
@@ -468,6 +468,34 @@ def test_a_searched_part_is_told_by_the_reliability():
     assert result.mask[unseen & scene.inliers].mean() > 0.5
     other = estimate(scene.X, random_state=1)
     assert not np.array_equal(unseen, np.isnan(other.reliability))
+
+
+def test_a_part_is_spread_as_all_are():
+    """Every cell of the first image has its share in the part, but for a match at either end."""
+    X = scene_of(0, 20_000, 0.4).X
+    X[0] = 7.0  # the rows' order and a lonely match do not matter
+    rows = _spread(X, 3000, np.random.default_rng(0))
+    assert (np.diff(rows) > 0).all()
+    assert len(rows) == 3000
+    low, side = X[:, :2].min(axis=0), np.ptp(X[:, :2], axis=0).max()
+    cells = np.minimum((X[:, :2] - low) / side * _CELLS[0], _CELLS[0] - 1).astype(int)
+    number = cells[:, 0] * _CELLS[0] + cells[:, 1]
+    share = np.bincount(number, minlength=_CELLS[0] ** 2) * 3000 / 20_000
+    assert share.max() > 20
+    assert np.abs(np.bincount(number[rows], minlength=len(share)) - share).max() <= 2
+    # Of a cell's matches, those that go elsewhere in the second image have theirs, nearly.
+    lower = X[:, 3] > np.median(X[:, 3])
+    share = np.bincount(number[lower], minlength=len(share)) * 3000 / 20_000
+    off = np.bincount(number[rows][lower[rows]], minlength=len(share)) - share
+    assert np.square(off).sum() < 0.4 * (share * (1 - 3000 / 20_000)).sum()
+
+
+@pytest.mark.parametrize("n", [1, 99, 100, 101, 150, 199])
+def test_a_part_has_each_match_once(n):
+    X = np.random.default_rng(n).uniform(0, 900, (n, 4))
+    for Y in (X, np.zeros((n, 4)), X * [1e30, 1e30, 1e-30, 1e-30]):
+        rows = _spread(Y, 100, np.random.default_rng(1))
+        assert len(np.unique(rows)) == len(rows) == min(n, 100)
 
 
 # Symmetries and repetition
