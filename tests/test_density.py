@@ -42,6 +42,37 @@ def test_dc_is_the_order_statistic(X, percent):
     assert low * (1 - 1e-12) < dc <= high * (1 + 1e-12)
 
 
+@given(X=points, percent=st.floats(0.1, 100) | st.just(100.0))
+def test_dc_lies_half_way_to_the_next_distance(X, percent):
+    low, high = reference.cutoff_interval(X.tolist(), percent)
+    dc = density_peaks(X, dc_percent=percent).dc
+    if low == 0 or high / low < 1 + 1e-8:
+        return  # no distances, or such as differ by rounding
+    assert dc == pytest.approx((low + high) / 2 if high < np.inf else low, rel=1e-8)
+    assert dc > low
+
+
+def test_distances_that_differ_by_less_than_1e_9_are_one():
+    for gap, rho in ((1.5e-9, [1, 1, 0]), (0.7e-9, [1, 2, 1])):
+        peaks = density_peaks([[0.0], [1.0], [2 + gap]], dc_percent=1.0)
+        assert peaks.rho.tolist() == rho
+
+
+def test_numbers_of_any_type_and_the_default_percentage():
+    X = np.random.default_rng(0).integers(-120, 120, (300, 4))
+    expected = density_peaks(X.astype(float), dc=None, dc_percent=2.0, kernel="cutoff")
+    for kind in (np.int8, np.int64, np.float32):
+        peaks = density_peaks(X.astype(kind))
+        assert peaks.dc == expected.dc
+        np.testing.assert_array_equal(peaks.rho, expected.rho)
+        np.testing.assert_array_equal(peaks.delta, expected.delta)
+
+
+def test_no_weight_at_a_distance_that_overflows():
+    peaks = density_peaks([[0.0], [1e150], [1e150]], dc=1e-100, kernel="gaussian")
+    assert peaks.rho.tolist() == [0, 1, 1]
+
+
 @given(X=lattice, dc=st.integers(1, 18).map(lambda s: float(np.sqrt(s))))
 def test_cutoff_kernel_is_strict_at_the_boundary(X, dc):
     assert density_peaks(X, dc=dc).rho.tolist() == reference.density(X.tolist(), dc, "cutoff")
@@ -86,6 +117,23 @@ def test_the_border_of_a_halo_is_strictly_nearer_than_dc(X, block, dc):
     assert halo == reference.halo(X.tolist(), peaks.rho.tolist(), labels.tolist(), dc)
 
 
+def test_a_neighbor_at_just_dc_is_none():
+    peaks = density_peaks([[0.0], [1.0], [2.0], [3.5]], dc=1.0)
+    assert peaks.rho.tolist() == [0, 0, 0, 0]
+    assert not peaks.halo([0, 1, 2, 2]).any()
+    peaks = density_peaks([[0.0], [1.0], [2.0], [3.5]], dc=np.nextafter(1.0, 2.0))
+    assert peaks.rho.tolist() == [1, 2, 1, 0]
+    assert peaks.halo([0, 1, 2, 2]).tolist() == [True, True, True, True]
+    assert peaks.halo([0, 1, 1, 2]).tolist() == [True, True, True, False]
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_the_size_of_blocks_does_not_matter_to_a_sample(kernel):
+    X = np.random.default_rng(0).normal(size=(200, 3))
+    one, many = (peaks_of(X, b, kernel=kernel, sample_size=30) for b in (1 << 20, 600))
+    np.testing.assert_allclose(many.rho, one.rho, rtol=1e-12)
+
+
 def test_ties_beyond_the_first_neighbors():
     """On a lattice more points are equally far than a neighbour list holds."""
     X = np.stack(np.meshgrid(*[np.arange(6.0)] * 3), axis=-1).reshape(-1, 3)
@@ -106,6 +154,15 @@ def test_centers(X, alpha):
     assert peaks.predecessor[centers[0]] == -1
     assert (np.diff(peaks.gamma[centers]) <= 0).all()
     assert peaks.centers(n=len(centers)).tolist() == centers.tolist()
+
+
+def test_equal_centers_come_in_the_order_of_the_rows():
+    X = np.random.default_rng(0).permutation(np.repeat(np.arange(100.0), 3))[:, None]
+    peaks = density_peaks(X, dc=0.5)
+    assert len(np.unique(peaks.gamma)) < 20
+    expected = sorted(range(300), key=lambda row: (-peaks.gamma[row], row))
+    assert peaks.centers(n=300).tolist() == expected
+    assert peaks.centers(alpha=0).tolist() == expected
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
@@ -142,11 +199,11 @@ def test_no_matrix_is_held(kernel):
 
 @pytest.mark.parametrize("percent", [0.5, 2.0, 10.0])
 def test_sampled_dc_stays_within_its_stated_error(percent):
-    X = np.random.default_rng(1).normal(size=(4001, 4))
+    X = 100 + np.random.default_rng(1).normal(size=(4001, 4))
     peaks = density_peaks(X, dc_percent=percent)
     standard_error = np.sqrt((100 / percent - 1) / 1e6)
     miss = peaks.rho.mean() / (percent / 100 * len(X)) - 1
-    assert abs(miss) < 4 * standard_error
+    assert 1e-6 < abs(miss) < 4 * standard_error  # a sample hits by chance
     assert density_peaks(X, dc_percent=percent).dc == peaks.dc
     exact = density_peaks(X[:4000], dc_percent=percent)
     assert exact.rho.mean() == pytest.approx(percent / 100 * 4000, rel=1e-6)
@@ -200,8 +257,10 @@ def test_row_order_only_renames_the_rows(seed):
         ([[0.0], [np.nan]], {}, "NaN"),
         ([[0.0], [np.inf]], {}, "infinite"),
         ([[0.0], [1e200]], {}, "rescale"),
+        ([[0.0] * 4, [1e154] * 4], {}, "rescale"),
         ([[0.0], [1.0]], {"dc": 0.0}, "dc is a distance"),
         ([[0.0], [1.0]], {"dc": np.nan}, "dc is a distance"),
+        ([[0.0], [1.0]], {"dc": np.inf}, "dc is a distance"),
         ([[0.0], [1.0]], {"dc_percent": 0.0}, "percentage"),
         ([[0.0], [1.0]], {"dc_percent": 101.0}, "percentage"),
         ([[0.0], [1.0]], {"kernel": "box"}, "'cutoff' or 'gaussian'"),
@@ -212,6 +271,16 @@ def test_wrong_input_is_named(X, options, message):
         density_peaks(X, **options)
 
 
+def test_a_column_may_be_far_from_another():
+    assert density_peaks([[0.0, 1e200], [3.0, 1e200]]).delta.tolist() == [3.0, 3.0]
+
+
+def test_the_largest_alpha_leaves_the_densest():
+    peaks = density_peaks([[0.0], [1.0], [1.5], [9.0]], dc=1.2)
+    assert peaks.rho.tolist() == [1, 2, 1, 0]
+    assert peaks.centers(alpha=1).tolist() == [1]
+
+
 @pytest.mark.parametrize("options", [{}, {"alpha": 0.1, "n": 2}, {"alpha": 1.1}, {"n": 0}])
 def test_centers_wants_one_rule_in_range(options):
     with pytest.raises(ValueError, match=r"alpha|n must lie"):
@@ -220,7 +289,7 @@ def test_centers_wants_one_rule_in_range(options):
 
 def test_labels_and_halo_refuse_what_does_not_fit():
     peaks = density_peaks(np.eye(5))
-    for centers in ([5], [-1], [1, 1]):
+    for centers in ([5], [-1], [1, 1], [0, 5], [4, -1]):
         with pytest.raises(ValueError, match="row numbers"):
             peaks.labels(centers)
     with pytest.raises(ValueError, match="shape"):

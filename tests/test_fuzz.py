@@ -507,6 +507,7 @@ CALLS: list[int] = []
 
 
 def in_a_process(name):
+    cv2.setNumThreads(1)
     warnings.simplefilter("error")
     # Said to the caller, and no fault: too few rows for a filter, and numpy on complex numbers.
     warnings.filterwarnings("ignore", ".* rows would be left", UserWarning)
@@ -528,6 +529,9 @@ def in_a_process(name):
 @pytest.mark.parametrize("name", TARGETS)
 def test_answers_or_refuses(name, monkeypatch):
     monkeypatch.setenv("OPENCV_IO_MAX_IMAGE_PIXELS", str(PIXELS))
+    # Threads reserve memory, the more the more cores there are.
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MALLOC_ARENA_MAX"):
+        monkeypatch.setenv(variable, "1")
     child = multiprocessing.get_context("spawn").Process(target=in_a_process, args=(name,))
     child.start()
     child.join()
