@@ -120,6 +120,31 @@ def test_lmeds_takes_two_and_a_half_robust_deviations():
     assert between > 0  # or the correction for small samples would not show
 
 
+@pytest.mark.parametrize("n", [7, 8, 60])
+def test_lmeds_of_exact_matches_takes_a_thousandth_of_a_pixel(n):
+    """As cv2, whose noise is never less than that; and of seven matches there is no deviation."""
+    F = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    X = np.random.default_rng(0).integers(0, 900, (n, 4)).astype(float)
+    X[:, 3] = X[:, 1]
+    for gap, inside in ((0.0009, True), (0.0011, False), (0.0019, False)):
+        X[0, 1], X[0, 3] = 0.0, gap
+        mask = inlier_mask(F, X, "lmeds", 3.0)
+        assert mask[0] == inside
+        assert mask[1:].all()
+    X[:, 3] += 1.0
+    assert inlier_mask(F, X, "lmeds", 3.0).all() == (n > 7)
+
+
+def test_a_distance_from_no_line_is_said_without_a_warning():
+    X = noisy_scene(0, n=20).X
+    infinitely_far = np.diag([0.0, 0.0, 1.0])
+    for rule in ("usac", "ransac", "lmeds"):
+        assert np.isnan(residuals(np.zeros((3, 3)), X, rule)).all()
+        assert np.isinf(residuals(infinitely_far, X, rule)).all()
+        assert not inlier_mask(np.zeros((3, 3)), X, rule, 1e9).any()
+        assert not inlier_mask(infinitely_far, X, rule, 1e9).any()
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_frame_and_back(seed):
     scene = noisy_scene(seed)
@@ -145,8 +170,9 @@ def test_distances_in_the_frame_are_pixels():
     )
 
 
-def test_frame_is_centred_with_one_scale_for_both_images():
-    X = np.random.default_rng(0).uniform(0, [100, 50, 4000, 3000], (50, 4))
+@pytest.mark.parametrize("unit", [1.0, 1e-4])
+def test_frame_is_centred_with_one_scale_for_both_images(unit):
+    X = unit * np.random.default_rng(0).uniform(0, [100, 50, 4000, 3000], (50, 4))
     frame = Frame(X)
     Z = np.vstack([frame.homogeneous1[:2], frame.homogeneous2[:2]])
     np.testing.assert_allclose(Z.mean(axis=1), 0, atol=1e-12)
@@ -320,6 +346,17 @@ def test_polish_takes_each_matrix_alone_and_each_its_own_scales():
     for start, G, width in zip(starts, together, widths, strict=True):
         alone = polish(frame, start[None], [width, width / 2])[0]
         np.testing.assert_allclose(unit(G), unit(alone), atol=1e-10)
+
+
+def test_a_step_of_polish_is_never_long():
+    """Six angles of rotation and one of the singular values: half a radian in all."""
+    frame = Frame(noisy_scene(0, n=30, inlier_ratio=0.3).X)
+    start = np.random.default_rng(0).normal(size=(500, 3, 3))
+    before = polish(frame, start, [])
+    way = np.linalg.norm(polish(frame, start, [1e4]) - before, axis=(1, 2))
+    # A rotation by a small angle on either side moves a matrix of norm 1 by no more than that.
+    assert way.max() < 0.55
+    assert np.quantile(way, 0.5) > 0.2
 
 
 def test_wrong_matches_hardly_move_polish():
