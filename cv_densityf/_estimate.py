@@ -225,9 +225,12 @@ def _spread(X: NDArray[np.float64], size: int, rng: np.random.Generator) -> NDAr
 
 def _winding(points: NDArray[np.float64], side: int) -> NDArray[np.intp]:
     """Give each point the number of its cell on a path up and down the columns of a grid."""
-    low = points.min(axis=0)
-    width = max(float((points.max(axis=0) - low).max()), 1e-300) / side
-    column, row = np.minimum((points - low) / width, side - 1).astype(np.intp).T
+    # Along columns: numpy takes several times as long across rows of two.
+    x, y = np.ascontiguousarray(points.T)
+    x, y = x - x.min(), y - y.min()
+    cells = side / max(float(x.max()), float(y.max()), 1e-300)
+    column = np.minimum(x * cells, side - 1).astype(np.intp)
+    row = np.minimum(y * cells, side - 1).astype(np.intp)
     return np.asarray(column * side + np.where(column % 2 == 1, side - 1 - row, row))
 
 
