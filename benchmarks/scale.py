@@ -31,13 +31,19 @@ CALLS = ("cv2:FM_RANSAC", RIVAL, "ours:FM_RANSAC", "ours:USAC_MAGSAC", "ours:USA
 SEARCH_ALL = "ours:USAC_MAGSAC, searching all"
 FILTER = "contrast, reliability, kept"
 MATRIX = "density peaks, distance matrix"
+SAMPLE_SIZE = 20_000
+SAMPLED = f"density_peaks, sample_size={SAMPLE_SIZE:,}"
 #: Exponents are fitted to the sizes between these.
 FIT = (1_000, 100_000)
 #: A search on all matches is compared up to here.
 MAX_SEARCH_ALL = 100_000
 #: The matrix version of density peaks is run up to here, and extrapolated like n^2.
 MAX_MATRIX = 4_000
+#: Other clusterers are run up to here.
+MAX_OTHERS = 20_000
 INLIER_RATIO, NOISE = 0.3, 0.5
+#: Inlier ratios at which a search on a part is held against one on all matches.
+RATIOS = (0.1, 0.2, 0.3, 0.5)
 
 
 @dataclass
@@ -98,6 +104,7 @@ def scale(
         raise ValueError("numbers of matches start at 2, scenes at 1")
     with one_thread():
         calls = measure_calls(numbers, scenes, kind)
+        parted = measure_parts([n for n in numbers if n <= FIT[1]], scenes, kind)
         clustering = measure_clustering(cluster_numbers, scenes, kind)
     parts = [
         f"Scenes `{kind}`, {INLIER_RATIO:.0%} inliers, noise {NOISE:g} px, threshold 1 px, "
@@ -110,10 +117,14 @@ def scale(
             "## Time, ms\n\n" + _times(calls, numbers),
             f"## Time / {RIVAL}\n\n" + _ratios(calls, numbers),
             "## Error, px\n\n" + _errors(calls, numbers),
+            *(["## Error / searching all matches\n\n" + _parts_table(parted)] if parted else []),
             "## Peak memory over the input, MB\n\n" + _memory(memory),
         ]
     if cluster_numbers:
         parts.append("## Clustering, ms\n\n" + _times(clustering, cluster_numbers))
+        if clustering[SAMPLED].errors:
+            title = "## Error of rho, |estimated / exact - 1|"
+            parts.append(f"{title}\n\n{_errors(clustering, cluster_numbers)}")
     if plot:
         draw(plot, calls, clustering)
     return "\n\n".join(parts) + "\n"
@@ -140,12 +151,45 @@ def _with_defaults(method: Method) -> Callable[[Pair], Any]:
     return lambda pair: method.estimate(pair, Settings())
 
 
+def measure_parts(
+    numbers: Sequence[int], scenes: int, kind: str
+) -> dict[float, dict[int, tuple[float, float]]]:
+    """Hold a search on a part of the matches against one on all of them.
+
+    Returns
+    -------
+    dict of float to dict of int to (float, float)
+        For each inlier ratio and number of matches, geometric means over the scenes: of the error
+        as a multiple of the error when all are searched, and likewise when only the part is known.
+    """
+    methods, _ = choose(["ours:USAC_MAGSAC"])
+    estimate = _with_defaults(methods[0])
+    found: dict[float, dict[int, tuple[float, float]]] = {}
+    for ratio in RATIOS:
+        for n in numbers:
+            if n <= _estimate.MAX_SEARCHED:
+                continue
+            multiples = []
+            for seed in range(scenes):
+                pair = make_scene(kind, n, ratio, NOISE, seed)
+                whole = pair.error(estimate(pair))
+                with patch.object(_estimate, "MAX_REFINED", _estimate.MAX_SEARCHED):
+                    alone = pair.error(estimate(pair))
+                with patch.object(_estimate, "MAX_SEARCHED", n):
+                    searched = pair.error(estimate(pair))
+                multiples.append((whole / searched, alone / searched))
+            mean = np.exp(np.log(multiples).mean(axis=0))
+            found.setdefault(ratio, {})[n] = float(mean[0]), float(mean[1])
+    return found
+
+
 def measure_clustering(numbers: Sequence[int], scenes: int, kind: str) -> dict[str, Series]:
     """Time density peaks beside other ways to cluster matches."""
     from sklearn.cluster import HDBSCAN
 
     functions: dict[str, Callable[[Pair], object]] = {
         "density_peaks": lambda pair: density_peaks(pair.X),
+        SAMPLED: lambda pair: density_peaks(pair.X, sample_size=SAMPLE_SIZE),
         MATRIX: lambda pair: matrix_density_peaks(pair.X),
         "sklearn HDBSCAN": lambda pair: HDBSCAN(min_cluster_size=10, copy=True).fit(pair.X),
     }
@@ -153,13 +197,22 @@ def measure_clustering(numbers: Sequence[int], scenes: int, kind: str) -> dict[s
         from pydpc import Cluster
 
         functions["pydpc"] = lambda pair: Cluster(pair.X, autoplot=False)
+    # Others that keep all distances meet the memory's end as well.
+    sizes = {"density_peaks": (0, FIT[1]), SAMPLED: (SAMPLE_SIZE + 1, np.inf)}
+    sizes["sklearn HDBSCAN"] = (0, MAX_OTHERS)
     series = {name: Series() for name in functions}
     for n in numbers:
         for pair in _scenes(kind, n, scenes):
             for name, function in functions.items():
-                # Others that keep all distances meet the memory's end as well.
-                if n <= MAX_MATRIX or name in ("density_peaks", "sklearn HDBSCAN"):
+                low, high = sizes.get(name, (0, MAX_MATRIX))
+                if low <= n <= high:
                     _add(series[name], pair, function, has_error=False)
+            if SAMPLE_SIZE < n <= FIT[1]:
+                estimated = density_peaks(pair.X, sample_size=SAMPLE_SIZE).rho
+                exact = density_peaks(pair.X).rho
+                some = exact > 0
+                error = np.median(np.abs(estimated[some] / exact[some] - 1))
+                series[SAMPLED].errors.setdefault(n, []).append(float(error))
     return series
 
 
@@ -204,9 +257,7 @@ def measure_memory(n: int, kind: str) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "X.npy"
         np.save(path, pair.X)
-        for name in (*CALLS, "density_peaks"):
-            if name == "density_peaks" and n > FIT[1]:
-                continue
+        for name in (*CALLS, "density_peaks" if n <= FIT[1] else SAMPLED):
             # A process of its own: memory that was freed before would hide a peak.
             with context.Pool(1) as pool:
                 peaks[name] = pool.apply(_peak, (name, str(path)))
@@ -215,8 +266,8 @@ def measure_memory(n: int, kind: str) -> dict[str, float]:
 
 def _peak(name: str, path: str) -> float:
     def call(X: Floats) -> None:
-        if name == "density_peaks":
-            density_peaks(X)
+        if name in ("density_peaks", SAMPLED):
+            density_peaks(X, sample_size=SAMPLE_SIZE if name == SAMPLED else None)
             return
         pair = Pair(
             name="", group="", X=X, scores=None, truth=X, size1=(0, 0), size2=(0, 0),
@@ -281,6 +332,16 @@ def _errors(series: Mapping[str, Series], numbers: Sequence[int]) -> str:
         if s.errors
     )
     return _table(["median over the scenes", *(f"N = {n:,}" for n in numbers)], body)
+
+
+def _parts_table(parted: Mapping[float, Mapping[int, tuple[float, float]]]) -> str:
+    numbers = list(next(iter(parted.values())))
+    body = []
+    for k, name in enumerate(("all vote", "only the part that is searched votes")):
+        for ratio, row in parted.items():
+            body.append([f"{name}, {ratio:.0%} inliers", *(f"{row[n][k]:.2f}" for n in numbers)])
+    header = ["geometric mean over the scenes", *(f"N = {n:,}" for n in numbers)]
+    return _table(header, body)
 
 
 def _memory(memory: Mapping[int, Mapping[str, float]]) -> str:

@@ -52,12 +52,31 @@ def test_tables_hold_every_method_and_size(capsys, tmp_path, monkeypatch):
     assert plot.stat().st_size > 10_000
 
 
+def test_a_part_is_held_against_all(monkeypatch):
+    monkeypatch.setattr(scale._estimate, "MAX_SEARCHED", 400)
+    monkeypatch.setattr(scale, "RATIOS", (0.3, 0.6))
+    found = scale.measure_parts([300, 6000], 2, "clusters")
+    assert {ratio: list(row) for ratio, row in found.items()} == {0.3: [6000], 0.6: [6000]}
+    # A fifteenth of the matches alone measures F worse than all of them do.
+    assert all(alone > max(1.3, whole) for row in found.values() for whole, alone in row.values())
+    table = scale._parts_table(found)
+    assert f"| all vote, 30% inliers | {found[0.3][6000][0]:.2f} |" in table
+
+
+def test_sampled_densities_are_measured_beside_exact_ones(monkeypatch):
+    monkeypatch.setattr(scale, "SAMPLE_SIZE", 500)
+    found = scale.measure_clustering([300, 600], 1, "clusters")
+    assert list(found["density_peaks"].ms) == [300, 600]
+    assert list(found[scale.SAMPLED].ms) == list(found[scale.SAMPLED].errors) == [600]
+    assert 0 < found[scale.SAMPLED].error(600) < 0.5
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_peak_memory_sees_what_is_allocated_and_freed(tmp_path, monkeypatch):
     path = tmp_path / "X.npy"
     np.save(path, np.zeros((1000, 4)))
 
-    def hungry(X):
+    def hungry(X, sample_size):
         np.ones((len(X), 12_500)).sum()  # 100 MB for the 1,000 rows
 
     monkeypatch.setattr(scale, "density_peaks", hungry)
