@@ -348,6 +348,19 @@ def test_polish_takes_each_matrix_alone_and_each_its_own_scales():
         np.testing.assert_allclose(unit(G), unit(alone), atol=1e-10)
 
 
+def test_polish_stays_where_nothing_tells_it_to_go():
+    """Of one spot no matrix is better; and a match at both epipoles tells nothing."""
+    start = np.diag([1.0, 1.0, 0.0])[None] / np.sqrt(2)
+    G = polish(Frame(np.full((20, 4), 7.0)), start, [1.0, 2.0])
+    np.testing.assert_allclose(G @ G.transpose(0, 2, 1), start @ start, atol=1e-12)
+    X = np.array([[0, 0, 0, 0], [1, 0, 2, 0], [-1, 0, -2, 0], [0, 3, 0, 4], [0, -3, 0, -4.0]])
+    forward = np.array([[[0.0, -1, 0], [1, 0, 0], [0, 0, 0]]])
+    frame = Frame(X)
+    np.testing.assert_array_equal(frame.sampson(frame.enter(forward)), np.zeros((1, 5)))
+    G = polish(frame, frame.enter(forward), [1.0])
+    np.testing.assert_allclose(unit(G[0]), unit(forward[0]), atol=1e-12)
+
+
 def test_a_step_of_polish_is_never_long():
     """Six angles of rotation and one of the singular values: half a radian in all."""
     frame = Frame(noisy_scene(0, n=30, inlier_ratio=0.3).X)
