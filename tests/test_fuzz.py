@@ -509,9 +509,11 @@ CALLS: list[int] = []
 def in_a_process(name):
     cv2.setNumThreads(1)
     warnings.simplefilter("error")
-    # Said to the caller, and no fault: too few rows for a filter, and numpy on complex numbers.
+    # Said to the caller, and no fault: too few rows for a filter; numpy on complex numbers, and on
+    # coordinates beyond cv2's float32 in an estimator.
     warnings.filterwarnings("ignore", ".* rows would be left", UserWarning)
     warnings.filterwarnings("ignore", category=np.exceptions.ComplexWarning)
+    warnings.filterwarnings("ignore", "overflow encountered in cast", RuntimeWarning)
     warnings.filterwarnings("ignore", category=HypothesisWarning)
     if sys.platform == "linux":
         import resource
