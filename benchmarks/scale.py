@@ -23,6 +23,7 @@ from benchmarks.scenes import make_scene
 from cv_densityf import _estimate
 from cv_densityf._density import density_peaks
 from cv_densityf._prefilter import contrast_support
+from cv_densityf.batch import estimate_many
 
 Floats = NDArray[np.float64]
 
@@ -42,6 +43,8 @@ MAX_MATRIX = 4_000
 #: Other clusterers are run up to here.
 MAX_OTHERS = 20_000
 INLIER_RATIO, NOISE = 0.3, 0.5
+#: Pairs estimated by one worker and by two, by the clock, the faster of some runs.
+N_PAIRS, PAIR_SIZE, RUNS = 200, 1_000, 5
 #: Inlier ratios at which a search on a part is held against one on all matches.
 RATIOS = (0.1, 0.2, 0.3, 0.5)
 
@@ -125,6 +128,8 @@ def scale(
         if clustering[SAMPLED].errors:
             title = "## Error of rho, |estimated / exact - 1|"
             parts.append(f"{title}\n\n{_errors(clustering, cluster_numbers)}")
+    with one_thread():
+        parts.append("## Pairs per second / one worker's\n\n" + _speedups(measure_workers(kind)))
     if plot:
         draw(plot, calls, clustering)
     return "\n\n".join(parts) + "\n"
@@ -230,6 +235,26 @@ def matrix_density_peaks(X: Floats) -> tuple[Floats, Floats]:
     delta[order] = ordered.min(axis=1)
     delta[order[0]] = largest
     return rho, delta
+
+
+def measure_workers(kind: str) -> dict[str, float]:
+    """Give the pairs per second of two workers, by the clock, as a multiple of one's."""
+    scenes = [make_scene(kind, PAIR_SIZE, INLIER_RATIO, NOISE, seed).X for seed in range(20)]
+    pairs = [(X[:, :2], X[:, 2:]) for X in scenes] * (N_PAIRS // len(scenes))
+    workers: dict[str, dict[str, Any]] = {
+        "one": {"n_jobs": 1},
+        "two processes": {"n_jobs": 2, "backend": "loky"},
+        "two threads": {"n_jobs": 2, "backend": "threading"},
+    }
+    best = dict.fromkeys(workers, np.inf)
+    # The first run, not counted, starts the processes.
+    for run in range(RUNS + 1):
+        for name, options in workers.items():
+            start = time.perf_counter()
+            list(estimate_many(pairs, progress=False, **options))
+            if run:
+                best[name] = min(best[name], time.perf_counter() - start)
+    return {name: best["one"] / seconds for name, seconds in best.items() if name != "one"}
 
 
 def _scenes(kind: str, n: int, scenes: int) -> Iterable[Pair]:
@@ -342,6 +367,11 @@ def _parts_table(parted: Mapping[float, Mapping[int, tuple[float, float]]]) -> s
             body.append([f"{name}, {ratio:.0%} inliers", *(f"{row[n][k]:.2f}" for n in numbers)])
     header = ["geometric mean over the scenes", *(f"N = {n:,}" for n in numbers)]
     return _table(header, body)
+
+
+def _speedups(found: Mapping[str, float]) -> str:
+    header = [f"{N_PAIRS} pairs of {PAIR_SIZE:,} matches", "by the clock"]
+    return _table(header, [[name, f"{ratio:.2f}"] for name, ratio in found.items()])
 
 
 def _memory(memory: Mapping[int, Mapping[str, float]]) -> str:

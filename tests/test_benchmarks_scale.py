@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 
 import cv2
 import numpy as np
@@ -36,6 +37,7 @@ def test_the_matrix_version_clusters_as_ours():
 def test_tables_hold_every_method_and_size(capsys, tmp_path, monkeypatch):
     # Starts a process per method, which takes its time.
     monkeypatch.setattr(scale, "measure_memory", lambda n, kind: {"density_peaks": 12.0})
+    monkeypatch.setattr(scale, "measure_workers", lambda kind: {"two processes": 1.75})
     plot = tmp_path / "scale.png"
     numbers = ["--n", "1000", "--cluster-n", "300", "600", "--scenes", "1"]
     assert main(["scale", *numbers, "--plot", str(plot)]) == 0
@@ -49,6 +51,7 @@ def test_tables_hold_every_method_and_size(capsys, tmp_path, monkeypatch):
     ]
     assert len(rival) == 4
     assert "| density_peaks |" in text.split("## Clustering")[1]
+    assert "| two processes | 1.75 |" in text
     assert plot.stat().st_size > 10_000
 
 
@@ -61,6 +64,21 @@ def test_a_part_is_held_against_all(monkeypatch):
     assert all(alone > max(1.3, whole) for row in found.values() for whole, alone in row.values())
     table = scale._parts_table(found)
     assert f"| all vote, 30% inliers | {found[0.3][6000][0]:.2f} |" in table
+
+
+def test_workers_are_timed_by_the_clock(monkeypatch):
+    monkeypatch.setattr(scale, "RUNS", 1)
+    calls = []
+
+    def slow(pairs, *, n_jobs, **_):
+        calls.append(len(pairs))
+        time.sleep(0.3 / n_jobs)
+        return []
+
+    monkeypatch.setattr(scale, "estimate_many", slow)
+    found = scale.measure_workers("clusters")
+    assert set(calls) == {scale.N_PAIRS}
+    assert all(1.3 < ratio < 3 for ratio in found.values())
 
 
 def test_sampled_densities_are_measured_beside_exact_ones(monkeypatch):
