@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
@@ -47,6 +48,9 @@ INLIER_RATIO, NOISE = 0.3, 0.5
 N_PAIRS, PAIR_SIZE, RUNS = 200, 1_000, 5
 #: Inlier ratios at which a search on a part is held against one on all matches.
 RATIOS = (0.1, 0.2, 0.3, 0.5)
+#: Pixels between the matches of a real pair's optical flow, and the share of them made wrong.
+STRIDES = (7, 4, 2, 1)
+WRONG = 0.4
 
 
 @dataclass
@@ -108,6 +112,7 @@ def scale(
     with one_thread():
         calls = measure_calls(numbers, scenes, kind)
         parted = measure_parts([n for n in numbers if n <= FIT[1]], scenes, kind)
+        dense = measure_dense()
         clustering = measure_clustering(cluster_numbers, scenes, kind)
     parts = [
         f"Scenes `{kind}`, {INLIER_RATIO:.0%} inliers, noise {NOISE:g} px, threshold 1 px, "
@@ -121,6 +126,7 @@ def scale(
             f"## Time / {RIVAL}\n\n" + _ratios(calls, numbers),
             "## Error, px\n\n" + _errors(calls, numbers),
             *(["## Error / searching all matches\n\n" + _parts_table(parted)] if parted else []),
+            "## Error on optical flow, px\n\n" + _errors(dense, list(dense[RIVAL].ms)),
             "## Peak memory over the input, MB\n\n" + _memory(memory),
         ]
     if cluster_numbers:
@@ -186,6 +192,49 @@ def measure_parts(
             mean = np.exp(np.log(multiples).mean(axis=0))
             found.setdefault(ratio, {})[n] = float(mean[0]), float(mean[1])
     return found
+
+
+def dense_pair(stride: int) -> Pair:
+    """Match scikit-image's stereo pair by optical flow, on every ``stride``-th pixel both ways.
+
+    The second points of `WRONG` of the matches are shuffled. Truth is the pair's disparity.
+    """
+    from skimage.data import stereo_motorcycle
+
+    left, right, disparity = stereo_motorcycle()
+    grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in (left, right)]
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM).calc(*grey, None)
+    height, width = grey[0].shape
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
+    X = np.dstack([pixels, pixels + flow])[::stride, ::stride].reshape(-1, 4)
+    rng = np.random.default_rng(0)
+    wrong = np.flatnonzero(rng.random(len(X)) < WRONG)
+    X[wrong, 2:] = X[rng.permutation(wrong), 2:]
+    known = np.isfinite(disparity) & (disparity > 0)
+    truth = np.hstack([pixels[known], pixels[known]])[::997]
+    truth[:, 2] -= disparity[known][::997]
+    size = (width, height)
+    return Pair(
+        name=f"stride {stride}", group="optical flow", X=rng.permutation(X), scores=None,
+        truth=truth, size1=size, size2=size, cameras=None, F_gt=None,
+    )  # fmt: skip
+
+
+def measure_dense() -> dict[str, Series]:
+    """Estimate F from a real pair's optical flow: as it is, with a part alone, searching all."""
+    methods, _ = choose([RIVAL, "ours:USAC_MAGSAC"])
+    rival, ours = (_with_defaults(method) for method in methods)
+    series = {name: Series() for name in (RIVAL, "ours", "ours, the part alone", SEARCH_ALL)}
+    for pair in map(dense_pair, STRIDES):
+        n = len(pair.X)
+        _add(series[RIVAL], pair, rival)
+        _add(series["ours"], pair, ours)
+        with patch.object(_estimate, "MAX_REFINED", _estimate.MAX_SEARCHED):
+            _add(series["ours, the part alone"], pair, ours)
+        if n <= MAX_SEARCH_ALL:
+            with patch.object(_estimate, "MAX_SEARCHED", n):
+                _add(series[SEARCH_ALL], pair, ours)
+    return series
 
 
 def measure_clustering(numbers: Sequence[int], scenes: int, kind: str) -> dict[str, Series]:

@@ -38,6 +38,7 @@ def test_tables_hold_every_method_and_size(capsys, tmp_path, monkeypatch):
     # Starts a process per method, which takes its time.
     monkeypatch.setattr(scale, "measure_memory", lambda n, kind: {"density_peaks": 12.0})
     monkeypatch.setattr(scale, "measure_workers", lambda kind: {"two processes": 1.75})
+    monkeypatch.setattr(scale, "STRIDES", (20,))
     plot = tmp_path / "scale.png"
     numbers = ["--n", "1000", "--cluster-n", "300", "600", "--scenes", "1"]
     assert main(["scale", *numbers, "--plot", str(plot)]) == 0
@@ -64,6 +65,18 @@ def test_a_part_is_held_against_all(monkeypatch):
     assert all(alone > max(1.3, whole) for row in found.values() for whole, alone in row.values())
     table = scale._parts_table(found)
     assert f"| all vote, 30% inliers | {found[0.3][6000][0]:.2f} |" in table
+
+
+def test_optical_flow_is_of_the_stereo_pair():
+    pytest.importorskip("skimage")
+    pair = scale.dense_pair(10)
+    rectified = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    assert pair.error(rectified) == 0
+    assert len(pair.X) == 75 * 50
+    # Most of what is not shuffled is right.
+    assert 0.5 < np.mean(np.abs(pair.X[:, 1] - pair.X[:, 3]) < 1) < 0.65
+    leftwards = pair.X[:, 0] - pair.X[:, 2]
+    assert np.mean(leftwards[np.abs(pair.X[:, 1] - pair.X[:, 3]) < 1] > 0) > 0.9
 
 
 def test_workers_are_timed_by_the_clock(monkeypatch):
