@@ -5,10 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from cv_densityf._engine import draw
-from cv_densityf._epipolar import Frame, eight_point, point_line_squared, polish, shift
+from cv_densityf._epipolar import (
+    Frame,
+    eight_point,
+    essential_ratio,
+    point_line_squared,
+    polish,
+    shift,
+)
 from cv_densityf._stopwatch import Stopwatch
 
 Floats = NDArray[np.floating]
@@ -26,7 +33,17 @@ MIN_DRAW = 30
 #: parts. More find no better F; several short draws do.
 MAX_DRAW_ITERS = 1000
 #: Two hypotheses agree when their inlier sets have this intersection over union.
-_AGREEMENT = 0.97
+_AGREEMENT = 0.93
+#: Draws from parts whose sizes differ by less than this factor are not independent.
+_DISTINCT = 1.4
+#: Rounds of the local optimisation, their samples and largest size of these, how many working
+#: thresholds from the best hypothesis they are taken, and how far their polish looks.
+_LOCAL_ROUNDS = 2
+_LOCAL_SAMPLES = 10
+_LOCAL_SIZE = 14
+_LOCAL_WIDTH = 3.0
+_LOCAL_REACH = 20.0
+_LOCAL_STEPS = 2
 #: Widths of the vote, in units of the working threshold.
 _VOTE_WIDTHS = np.array([0.3, 0.5, 0.8, 1.3])
 #: Votes saturate within a cell of this many to the longer side of each image.
@@ -37,7 +54,7 @@ _POLISH_STEPS = 3
 #: The winner's last steps take weights of this many robust standard deviations: nearly all of what
 #: least squares gets out of normal noise, and little of what heavier tails put in.
 _REFINE_SIGMAS = 3.0
-_REFINE_STEPS = 3
+_REFINE_STEPS = 2
 _NARROWEST = 0.1
 #: Noise may exceed the caller's threshold; residuals beyond this many of it are wrong matches.
 _WIDEST = 3.0
@@ -75,7 +92,8 @@ def search(
     Rounds of two draws on nested sets of the most reliable matches, on all of them, and on what
     the best hypothesis so far leaves near its epipolar lines: a nearly right F has the right one's
     inliers there. Each hypothesis is polished on all matches. The search ends when a second,
-    independent draw arrives at the winner's inliers, or after `ROUNDS`.
+    independent draw arrives at the winner's inliers, or after `ROUNDS` and a local optimisation of
+    the best hypothesis.
 
     Parameters
     ----------
@@ -105,15 +123,16 @@ def search(
     order = np.argsort(-reliability, kind="stable")
     points = X[order].astype(np.float32)
     reliable = order[: max(MIN_DRAW, n // 2)]
-    pool = _Pool(X, reliability, threshold)
+    pool = _Pool(X, reliability, reliable, threshold, np.random.default_rng(abs(seed)))
     n_draws = 0
-    found = []
+    found, sizes = [], []
     if scores is not None:
         ranked = X[np.argsort(-scores, kind="stable")].astype(np.float32)
         F = draw(ranked, threshold, confidence, max_iters, seed, best_first=True)
         n_draws = 1
         if F is not None:
             found.append(F)
+            sizes.append(n)
     for fractions in ROUNDS:
         for fraction in fractions:
             if fraction != NEAR:
@@ -128,19 +147,23 @@ def search(
             n_draws += 1
             if F is not None:
                 found.append(F)
+                sizes.append(len(part))
         watch.lap("draws")
         if found:
             first = len(pool) == 0
-            pool.add(np.stack(found))
+            pool.add(np.stack(found), sizes)
             if first:
-                pool.adapt(reliable)
-            found = []
+                pool.adapt()
+            found, sizes = [], []
         watch.lap("polish")
         if pool.agrees():
             break
-    if len(pool) == 0:
-        return None
-    F = pool.refined_best(reliable)
+    else:
+        if len(pool) == 0:
+            return None
+        for _ in range(_LOCAL_ROUNDS):
+            pool.optimise()
+    F = pool.refined_best()
     F = shift(-centre[2:]).T @ F @ shift(-centre[:2])
     watch.lap("polish")
     again = ", found again by another" if pool.agrees() else ""
@@ -155,14 +178,30 @@ class _Pool:
     noise is smaller. The caller's threshold rules the mask; the width of the noise is the data's.
     """
 
-    def __init__(self, X: Floats, reliability: Floats, threshold: float) -> None:
+    def __init__(
+        self,
+        X: Floats,
+        reliability: Floats,
+        reliable: Ints,
+        threshold: float,
+        rng: np.random.Generator,
+    ) -> None:
         self.threshold = threshold
         self.working = threshold
         self.votes: Floats = np.empty(0)
+        self._X = X
+        self._reliable = reliable
+        self._rng = rng
         self._frame = Frame(X)
         self._ballot = _Ballot(X, reliability)
+        # The reliable matches show where the images are, and how large.
+        seen = X[reliable]
+        centre = seen.mean(axis=0)
+        self._centred = shift(centre[:2]), shift(centre[2:])
+        self._image_size = float(np.sqrt(12.0 * ((seen - centre) ** 2).mean()))
         self._G: Floats = np.empty((0, 3, 3))
         self._squared: Floats = np.empty((0, len(X)))
+        self._sizes: Floats = np.empty(0)
 
     def __len__(self) -> int:
         return len(self._G)
@@ -172,41 +211,72 @@ class _Pool:
         """Index of the hypothesis with the most votes."""
         return int(self.votes.argmax())
 
-    def add(self, F: Floats) -> None:
-        """Polish hypotheses (m, 3, 3), in pixels, and count the votes for them."""
+    def add(self, F: Floats, sizes: ArrayLike) -> None:
+        """Polish hypotheses (m, 3, 3), in pixels, drawn from ``sizes`` matches, and count votes."""
         widths = [_POLISH_WIDTH * self.working] * _POLISH_STEPS
         G = polish(self._frame, self._frame.enter(F), widths)
-        squared = self._frame.sampson(G)
+        self._append(G, *self._poll(G), sizes)
+
+    def _append(self, G: Floats, squared: Floats, votes: Floats, sizes: ArrayLike) -> None:
         self._G = np.concatenate([self._G, G])
         self._squared = np.concatenate([self._squared, squared])
-        self.votes = np.concatenate([self.votes, self._ballot.count(squared, self.working)])
+        self.votes = np.concatenate([self.votes, votes])
+        self._sizes = np.concatenate([self._sizes, sizes])
 
-    def adapt(self, reliable: Ints) -> None:
+    def _poll(self, G: Floats) -> tuple[Floats, Floats]:
+        """Squared residuals (m, n) of hypotheses and the votes for them (m,)."""
+        squared = self._frame.sampson(G)
+        first, second = self._centred
+        F = second.T @ self._frame.leave(G) @ first
+        credit = essential_ratio(F, self._image_size)
+        return squared, self._ballot.count(squared, self.working) * credit
+
+    def adapt(self) -> None:
         """Narrow the working threshold to the noise of the best hypothesis so far."""
-        scale = _SIGMAS * _noise(self._squared[self.best, reliable], self.threshold)
+        scale = _SIGMAS * _noise(self._squared[self.best, self._reliable], self.threshold)
         if scale < self.threshold:
             self.working = max(scale, _SMALLEST_SCALE * self.threshold)
-            F = self._frame.leave(self._G)
-            self._G, self._squared, self.votes = self._G[:0], self._squared[:0], self.votes[:0]
-            self.add(F)
+            F, sizes = self._frame.leave(self._G), self._sizes
+            self._G, self._squared = self._G[:0], self._squared[:0]
+            self.votes, self._sizes = self.votes[:0], self._sizes[:0]
+            self.add(F, sizes)
 
     def near_best(self, width: float) -> Bools:
         """Mark the matches within ``width`` working thresholds of the best hypothesis."""
         return np.asarray(self._squared[self.best] < (width * self.working) ** 2)
 
+    def optimise(self) -> None:
+        """Fit samples of the best hypothesis's neighbours; the fit with the most votes joins.
+
+        The inner sampling of Chum, Matas and Kittler, "Locally optimized RANSAC" (2003), with the
+        vote as its score.
+        """
+        near = np.flatnonzero(self.near_best(_LOCAL_WIDTH))
+        size = min(_LOCAL_SIZE, len(near) // 2)
+        if size < 8:
+            return
+        keys = self._rng.random((_LOCAL_SAMPLES, len(near)))
+        F = eight_point(self._X[near[keys.argpartition(size - 1, axis=1)[:, :size]]])
+        part = self._frame.part(self.near_best(_LOCAL_REACH))
+        G = polish(part, part.enter(F), [_POLISH_WIDTH * self.working] * _LOCAL_STEPS)
+        squared, votes = self._poll(G)
+        best = [votes.argmax()]
+        self._append(G[best], squared[best], votes[best], [0])
+
     def agrees(self) -> bool:
-        """Whether another hypothesis has the best one's inliers."""
+        """Whether draws from two different parts have the best hypothesis's inliers."""
         if len(self) < 2:
             return False
         inliers = (self._squared < self.working**2).astype(np.float32)
         common = inliers @ inliers[self.best]
         union = inliers.sum(axis=1) + common[self.best] - common
-        return int(np.count_nonzero(common >= _AGREEMENT * union)) > 1
+        sizes = self._sizes[(common >= _AGREEMENT * union) & (self._sizes > 0)]
+        return len(sizes) > 1 and bool(sizes.max() >= _DISTINCT * sizes.min())
 
-    def refined_best(self, reliable: Ints) -> NDArray[np.float64]:
+    def refined_best(self) -> NDArray[np.float64]:
         """Polish the best hypothesis at the width of its own residuals; in pixels, (3, 3)."""
         best = self._G[self.best]
-        return _refined(self._frame, best, reliable, self.threshold)
+        return _refined(self._frame, best, self._reliable, self.threshold)
 
 
 def refine(F: Floats, X: Floats, reliable: Ints, threshold: float) -> NDArray[np.float64]:

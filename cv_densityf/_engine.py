@@ -147,6 +147,7 @@ def draw(
     params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
     params.loIterations = 5
     params.loSampleSize = 20
+    params.final_polisher = cv2.NONE_POLISHER  # the caller polishes
     try:
         F, _ = original(points[:, :2], points[:, 2:], params)
     except cv2.error:

@@ -7,6 +7,7 @@ matrix satisfies ``[x', y', 1] @ F @ [x, y, 1] == 0``.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from typing import Literal
 
 import numpy as np
@@ -124,6 +125,13 @@ class Frame:
         self._first = zoom @ shift(-centre[:2])
         self._second = zoom @ shift(-centre[2:])
 
+    def part(self, rows: NDArray[np.bool_]) -> Frame:
+        """Return the same frame, holding only the matches marked in ``rows`` (n,)."""
+        part = copy(self)
+        for name in ("homogeneous1", "homogeneous2", "outer", "products"):
+            setattr(part, name, getattr(self, name)[:, rows])
+        return part
+
     def enter(self, F: Floats) -> Floats:
         """Fundamental matrices (m, 3, 3) in pixels, in this frame and of unit norm."""
         G = np.linalg.inv(self._second).T @ F @ np.linalg.inv(self._first)
@@ -159,6 +167,46 @@ _SKEW[0, 2, 1] = _SKEW[1, 0, 2] = _SKEW[2, 1, 0] = 1.0
 _SKEW[0, 1, 2] = _SKEW[1, 2, 0] = _SKEW[2, 0, 1] = -1.0
 _HALF_SKEW = 0.5 * _SKEW.reshape(3, 9)
 _EYE = np.eye(3)
+
+
+#: Squared focal lengths, in sizes of the image: from wide angle to telephoto.
+_FOCAL_SQUARED = np.geomspace(0.5, 4.0, 8) ** 2
+_ONES = np.ones_like(_FOCAL_SQUARED)
+#: What the focal length multiplies the squares of a matrix's rows by, and of its cofactors' rows.
+_ENTRY_GAIN = np.stack([_FOCAL_SQUARED, _FOCAL_SQUARED, _ONES])
+_COFACTOR_GAIN = np.stack([_FOCAL_SQUARED, _FOCAL_SQUARED, _FOCAL_SQUARED**2])
+
+
+def essential_ratio(F: Floats, image_size: float) -> NDArray[np.float64]:
+    """How nearly two ordinary cameras can have these fundamental matrices, in [0, 1].
+
+    With square pixels and the principal point in the middle of the image, ``K'^T F K`` is an
+    essential matrix for the right focal lengths: its two singular values are equal. Returned is
+    the smaller over the larger one, for the focal lengths that bring them closest, each between
+    half the image size and four times as much. Those of a wrong matrix are often imaginary, or
+    absurd. Hartley and Zisserman, "Multiple view geometry" (2004), sections 9.6 and 19.4.
+
+    Parameters
+    ----------
+    F : array, shape (m, 3, 3)
+        Matrices of rank 2, in pixels from the middle of either image.
+    image_size : float
+        Pixels.
+    """
+    zoom = np.array([image_size, image_size, 1.0])
+    U, S, Vt = np.linalg.svd(F * np.outer(zoom, zoom))
+    entries = (U[:, :, :2] * S[:, None, :2]) @ Vt[:, :2]
+    # Of K'^T F K: the sum of the squared singular values, and twice their product.
+    total = _ENTRY_GAIN.T @ entries**2 @ _ENTRY_GAIN
+    epipole2, epipole1 = U[:, :, 2] ** 2 @ _COFACTOR_GAIN, Vt[:, 2] ** 2 @ _COFACTOR_GAIN
+    twice = (
+        2.0
+        * (S[:, 0] * S[:, 1])[:, None, None]
+        * np.sqrt(epipole2[:, :, None] * epipole1[:, None, :])
+    )
+    difference = np.sqrt(np.maximum(total - twice, 0.0))
+    both = np.sqrt(total + twice)
+    return np.asarray(((both - difference) / (both + difference)).max(axis=(1, 2)))
 
 
 def eight_point(samples: Floats) -> NDArray[np.float64]:

@@ -10,11 +10,20 @@ from cv_densityf import _consensus
 from cv_densityf._consensus import (
     _Ballot,
     _noise,
+    _Pool,
     _samples_needed,
     eight_point_ransac,
     search,
 )
-from cv_densityf._epipolar import Frame, point_line_squared, polish, sampson_distance
+from cv_densityf._epipolar import (
+    Frame,
+    eight_point,
+    essential_ratio,
+    point_line_squared,
+    polish,
+    sampson_distance,
+    shift,
+)
 from cv_densityf._prefilter import contrast_reliability
 from cv_densityf._stopwatch import Stopwatch
 from cv_densityf.datasets import two_view_scene
@@ -131,6 +140,81 @@ def test_ends_when_two_draws_agree():
         n_poor.append(find(scene_of(seed, n=300, inlier_ratio=0.05).X).n_draws)
     assert max(n_clean) <= 4
     assert np.mean(n_poor) > 1.5 * np.mean(n_clean)
+
+
+def test_draws_from_the_same_matches_are_no_agreement(monkeypatch):
+    """Of 30 matches every part is all of them, so that agreement says nothing."""
+    scene = scene_of(0, n=30, inlier_ratio=0.9)
+    sizes = []
+    draw = _consensus.draw
+
+    def spied(points, *args, **kwargs):
+        sizes.append(len(points))
+        return draw(points, *args, **kwargs)
+
+    monkeypatch.setattr(_consensus, "draw", spied)
+    find(scene.X)
+    assert len(sizes) > 2
+    assert sizes[:2] == [30, 30]
+
+
+def impossible(rng, X):
+    """Find an F that no two cameras can have, and move the second points onto its lines."""
+    low, high = X.min(axis=0), X.max(axis=0)
+    middle, size = X.mean(axis=0), float((high - low).max())
+    zoom = np.diag([1 / size, 1 / size, 1])
+    while True:
+        U, S, Vt = np.linalg.svd(rng.normal(size=(3, 3)))
+        F = zoom @ (U * [S[0], S[1], 0.0]) @ Vt @ zoom
+        if essential_ratio(F[None], size)[0] > 0.5:
+            continue
+        F = shift(-middle[2:]).T @ F @ shift(-middle[:2])
+        lines = np.hstack([X[:, :2], np.ones((len(X), 1))]) @ F.T
+        offset = (X[:, 2:] * lines[:, :2]).sum(axis=1) + lines[:, 2]
+        moved = X[:, 2:] - lines[:, :2] * (offset / (lines[:, :2] ** 2).sum(axis=1))[:, None]
+        Y = np.hstack([X[:, :2], moved])
+        return F, Y[((low < Y) & (high > Y)).all(axis=1)]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_cameras_that_can_exist_win_over_a_few_more_votes(seed, monkeypatch):
+    scene = two_view_scene(100, inlier_ratio=1.0, noise=0.0, random_state=seed)
+    rng = np.random.default_rng(seed)
+    low, high = scene.X.min(axis=0), scene.X.max(axis=0)
+    while True:
+        F, others = impossible(rng, rng.uniform(low, high, (500, 4)))
+        if len(others) > 110:
+            break
+    X = np.vstack([scene.X, others[:110]])
+    everyone = np.arange(len(X))
+
+    def winner():
+        pool = _Pool(X, np.ones(len(X)), everyone, 1.0, rng)
+        pool.add(np.stack([scene.F, F]), [50, 100])
+        return pool.best
+
+    assert winner() == 0
+    monkeypatch.setattr(_consensus, "essential_ratio", lambda F, size: np.ones(len(F)))
+    assert winner() == 1
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_local_optimisation_finds_more_votes_near_a_poor_hypothesis(seed):
+    """A hypothesis that only a few crowded matches fixed gets better; it never gets worse."""
+    scene = scene_of(seed, inlier_ratio=0.3)
+    X = scene.X - scene.X.mean(axis=0)
+    right = X[scene.inliers]
+    crowd = np.argsort(np.linalg.norm(right - right[0], axis=1))[:25]
+    everyone = np.arange(len(X))
+    pool = _Pool(X, np.ones(len(X)), everyone, 1.0, np.random.default_rng(seed))
+    pool.add(eight_point(right[None, crowd]), [25])
+    before = pool.votes.max()
+    for _ in range(5):
+        most = pool.votes.max()
+        pool.optimise()
+        assert pool.votes.max() >= most
+    assert pool.votes.max() > before
+    assert not pool.agrees()
 
 
 def test_two_different_answers_are_no_agreement(monkeypatch):

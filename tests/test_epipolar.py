@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from cv_densityf._epipolar import (
     Frame,
     _rotation,
     eight_point,
+    essential_ratio,
     inlier_mask,
     point_line_squared,
     polish,
@@ -386,3 +389,39 @@ def test_wrong_matches_hardly_move_polish():
         assert error[1] < error[0] + 0.35
         flat = whole.leave(polish(whole, whole.enter(start), [1e4] * 5))[0]
         assert sampson_distance(flat, true).mean() > 3 * error[1]
+
+
+def random_rank_two(rng, count):
+    U, S, Vt = np.linalg.svd(rng.normal(size=(count, 3, 3)))
+    S[:, 2] = 0
+    return (U * S[:, None]) @ Vt
+
+
+def test_essential_ratio_is_the_best_ratio_of_singular_values_over_focal_lengths():
+    F = random_rank_two(np.random.default_rng(0), 20)
+    focal = 640 * np.geomspace(0.5, 4, 8)
+    expected = np.zeros(20)
+    for f1, f2 in itertools.product(focal, focal):
+        K1, K2 = np.diag([f1, f1, 1]), np.diag([f2, f2, 1])
+        S = np.linalg.svd(K2.T @ F @ K1, compute_uv=False)
+        expected = np.maximum(expected, S[:, 1] / S[:, 0])
+    np.testing.assert_allclose(essential_ratio(F, 640.0), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("f1", "f2"), [(0.8, 0.8), (1.2, 2.4), (0.6, 3.0)])
+def test_essential_ratio_believes_real_cameras_and_doubts_chance(f1, f2):
+    rng = np.random.default_rng(1)
+    size = 1000.0
+    K1, K2 = np.diag([f1 * size, f1 * size, 1]), np.diag([f2 * size, f2 * size, 1])
+    E = random_rank_two(rng, 50)
+    U, _, Vt = np.linalg.svd(E)
+    E = (U * [1.0, 1.0, 0.0]) @ Vt
+    real = essential_ratio(np.linalg.inv(K2).T @ E @ np.linalg.inv(K1), size)
+    zoom = np.diag([1 / size, 1 / size, 1])
+    chance = essential_ratio(zoom @ random_rank_two(rng, 500) @ zoom, size)
+    assert real.min() > 0.8
+    assert np.median(real) > 0.9
+    assert np.median(chance) < 0.85
+    np.testing.assert_allclose(  # the images' order does not matter
+        essential_ratio(E, size), essential_ratio(E.transpose(0, 2, 1), size), rtol=1e-9
+    )
