@@ -228,7 +228,8 @@ class _Pool:
         squared = self._frame.sampson(G)
         first, second = self._centred
         F = second.T @ self._frame.leave(G) @ first
-        credit = essential_ratio(F, self._image_size)
+        # The root: odd pixels or a cropped image should not decide.
+        credit = np.sqrt(essential_ratio(F, self._image_size))
         return squared, self._ballot.count(squared, self.working) * credit
 
     def adapt(self) -> None:
