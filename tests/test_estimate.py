@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import doctest
 import logging
 import re
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import FrozenInstanceError
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -633,16 +631,6 @@ def test_run_takes_params_and_their_rule():
     plain = run(X, Robust(cv2.USAC_DEFAULT, 2.0, 0.99, 1000, params), density="off")
     np.testing.assert_array_equal(plain.F, original(X[:, :2], X[:, 2:], params)[0])
     assert plain.engine == "usac"
-
-
-def test_the_explanation_runs():
-    guide = Path(__file__).parent.parent / "docs" / "how-it-works.md"
-    blocks = re.findall(r"^```python\n(.*?)^```$", guide.read_text("utf-8"), re.M | re.S)
-    test = doctest.DocTestParser().get_doctest("\n".join(blocks), {}, guide.name, str(guide), 0)
-    assert test.examples
-    report = []
-    doctest.DocTestRunner().run(test, out=report.append)
-    assert not report, "".join(report)
 
 
 def test_matches_beyond_the_search_refine_the_result(monkeypatch):

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import doctest
 import pickle
-import re
 import subprocess
 import sys
-from pathlib import Path
 
 import cv2
 import joblib
@@ -512,15 +509,3 @@ def test_decision_graph_display(scene):
 def test_importing_the_package_imports_no_scikit_learn():
     code = "import sys, cv_densityf; assert not {'sklearn', 'matplotlib'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_the_guide_runs():
-    guide = Path(__file__).parent.parent / "docs" / "estimators.md"
-    examples = "\n".join(
-        re.findall(r"^```python\n(.*?)^```$", guide.read_text("utf-8"), re.M | re.S)
-    )
-    test = doctest.DocTestParser().get_doctest(examples, {}, guide.name, str(guide), 0)
-    assert len(test.examples) > 40
-    report = []
-    doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(test, out=report.append)
-    assert not report, "".join(report)

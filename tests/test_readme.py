@@ -32,8 +32,3 @@ def test_python_runs(code):
     names = {"points1": scene.points1, "points2": scene.points2, "X": scene.X}
     exec(code, names)
     assert "F" in names or names["found"]
-
-
-@pytest.mark.parametrize("path", re.findall(r"\]\((?!http)([^)#]+)\)", README))
-def test_links_lead_somewhere(path):
-    assert (Path(__file__).parents[1] / path).is_file()
