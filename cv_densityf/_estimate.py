@@ -67,7 +67,8 @@ class Estimate:
     timings : dict of str to float
         Milliseconds per stage.
     votes : tuple of float
-        The vote for each polished hypothesis, in the order of the draws.
+        The vote for each polished hypothesis, in the order of the draws; where no two draws agree,
+        then for those of the local optimisation.
 
     See Also
     --------
