@@ -292,7 +292,143 @@ def test_draws_are_from_the_most_reliable(monkeypatch):
         np.testing.assert_allclose(points - points[0], expected, atol=1e-3)
 
 
+def spied_draws(monkeypatch, answer=lambda *_, **__: None):
+    """Record the arguments of each draw, which is then answered by ``answer``."""
+    seen = []
+
+    def draw(points, threshold, confidence, max_iters, seed, best_first=False):
+        seen.append((points, threshold, max_iters, best_first))
+        return answer(points, threshold, confidence, max_iters, seed, best_first)
+
+    monkeypatch.setattr(_consensus, "draw", draw)
+    return seen
+
+
+def test_scores_give_one_more_draw_in_their_order(monkeypatch):
+    X = scene_of(0).X
+    scores = np.random.default_rng(1).permutation(600) / 600
+    seen = spied_draws(monkeypatch)
+    assert find(X) is None
+    assert not any(best_first for *_, best_first in seen)
+    n = len(seen)
+    seen.clear()
+    assert find(X, scores=scores, threshold=2.5, max_iters=17) is None
+    assert len(seen) == n + 1
+    (points, threshold, max_iters, best_first), *others = seen
+    assert (threshold, max_iters, best_first) == (2.5, 17, True)
+    ranked = X[np.argsort(-scores)]
+    np.testing.assert_allclose(points - points[0], ranked - ranked[0], atol=1e-3)
+    assert not any(best_first for *_, best_first in others)
+
+
+def test_the_draw_by_scores_is_a_hypothesis_like_the_others(monkeypatch):
+    scene = scene_of(0)
+    centre = scene.X.mean(axis=0)
+    F = shift(centre[2:]).T @ scene.F @ shift(centre[:2])
+    seen = spied_draws(monkeypatch, lambda *arguments: F if arguments[5] else None)
+    found = find(scene.X, scores=np.ones(600))
+    assert sampson_distance(found.F, true_matches(0)).mean() < 0.5
+    assert found.n_draws == len(seen)
+
+
+def test_larger_parts_get_fewer_iterations(monkeypatch):
+    seen = spied_draws(monkeypatch)
+    find(scene_of(0).X, max_iters=10**6)
+    iterations = {len(points): max_iters for points, _, max_iters, _ in seen}
+    assert iterations[150] == iterations[75] == _consensus.MAX_DRAW_ITERS
+    assert iterations[600] == _consensus.MAX_DRAW_ITERS / 2
+    assert iterations[600] < iterations[450] < iterations[300] < iterations[150]
+
+
+@pytest.mark.parametrize(
+    ("noise", "threshold", "low", "high"),
+    [(0.1, 10.0, 2.5, 2.5), (1.2, 10.0, 3.5, 7.0), (0.9, 1.0, 1.0, 1.0)],
+)
+def test_the_noise_narrows_later_draws(monkeypatch, noise, threshold, low, high):
+    """To four standard deviations, down to a quarter of the threshold, and never beyond it."""
+    seen = spied_draws(monkeypatch, _consensus.draw)
+    monkeypatch.setattr(_Pool, "agrees", lambda pool: False)
+    find(scene_of(0, inlier_ratio=0.6, noise=noise).X, threshold=threshold)
+    first, second, *later = [call[1] for call in seen]
+    assert first == second == threshold
+    assert len(set(later)) == 1
+    assert low <= later[0] <= high
+
+
+def test_draws_near_the_best_take_what_lies_within_eight_thresholds():
+    scene = scene_of(0)
+    X = scene.X - scene.X.mean(axis=0)
+    pool = _Pool(X, np.ones(600), np.arange(600), 2.0, np.random.default_rng(0))
+    pool.add(eight_point(X[None, scene.inliers]), [50])
+    F = pool._frame.leave(pool._G)[0]
+    distance = sampson_distance(F, X)
+    for width in (1.0, 8.0):
+        np.testing.assert_array_equal(pool.near_best(width), distance < 2.0 * width)
+
+
+@pytest.mark.parametrize(
+    ("common", "more", "sizes", "agree"),
+    [
+        (100, 0, [50, 100], True),
+        (96, 0, [50, 100], True),
+        (100, 4, [50, 100], True),
+        (90, 0, [50, 100], False),
+        (100, 10, [50, 100], False),
+        (96, 4, [50, 100], False),
+        (100, 0, [50, 51], False),
+        (100, 0, [50, 0], False),
+    ],
+)
+def test_agreement_is_of_inliers_from_parts_of_other_sizes(common, more, sizes, agree):
+    """Of two sets of 100 and of ``common`` and ``more``, by what they share of their union."""
+    X = scene_of(0, n=300).X
+    pool = _Pool(X, np.ones(300), np.arange(300), 2.0, np.random.default_rng(0))
+    residuals = np.full((2, 300), 2.1)
+    residuals[0, :100] = 1.9
+    residuals[1, 100 - common : 100 + more] = 1.9
+    pool._append(np.zeros((2, 3, 3)), residuals**2, np.array([2.0, 1.0]), sizes)
+    assert pool.agrees() == agree
+
+
+def test_the_reason_tells_of_agreement_and_the_watch_of_both_stages(monkeypatch):
+    X = scene_of(0, inlier_ratio=0.9, noise=0.2).X
+    watch = Stopwatch()
+    found = search(X, contrast_reliability(X), seed=0, watch=watch, **ASKED)
+    assert found.reason.endswith(f" {found.n_draws} draws, found again by another")
+    assert set(watch.laps) == {"draws", "polish"}
+    monkeypatch.setattr(_Pool, "agrees", lambda pool: False)
+    assert find(X).reason.endswith(" draws")
+
+
 # The vote
+
+
+def test_cells_are_those_of_a_square_grid():
+    """Sixteen to the longer side, however long the other, and wherever the points are."""
+    rng = np.random.default_rng(0)
+    for size, offset in (((900, 300), (5, -2000)), ((0.1, 0.7), (3, 3))):
+        points = rng.uniform(0, size, (500, 2)) + offset
+        order, starts = _consensus._cells(points)
+        assert sorted(order) == list(range(500))
+        low = points.min(axis=0)
+        place = np.floor((points - low) * 16 / (points.max(axis=0) - low).max()).clip(max=15)
+        groups = np.split(order, starts[1:])
+        assert starts[0] == 0
+        assert len(groups) == len(np.unique(place, axis=0))
+        for group in groups:
+            assert len(np.unique(place[group], axis=0)) == 1
+
+
+def test_matches_at_one_spot_have_a_vote():
+    assert _Ballot(np.ones((30, 4)), np.ones(30)).count(np.zeros((1, 30)), 1.0) > 0
+
+
+def test_votes_end_at_the_largest_width():
+    X = spread_and_crowd()
+    squared = np.array([[(1.29 * 2.0) ** 2], [(1.31 * 2.0) ** 2]]) * np.ones(26)
+    inside, outside = _Ballot(X, np.ones(26)).count(squared, 2.0)
+    assert inside > 0
+    assert outside == 0
 
 
 def spread_and_crowd():
@@ -375,6 +511,13 @@ def test_noise_of_next_to_no_residuals_is_of_the_order_of_the_threshold():
         assert 0.1 < _noise(squared, 1.0) <= 1.0
 
 
+def test_noise_is_of_residuals_within_three_thresholds():
+    """Wrong matches all over have a median at 1.5 thresholds, and no more."""
+    r = np.linspace(0, 100, 10_000)
+    assert _noise(r**2, 1.0) == pytest.approx(1.4826 * 1.5, rel=0.15)
+    assert _noise((7 * r) ** 2, 7.0) == pytest.approx(7 * _noise(r**2, 1.0), rel=0.02)
+
+
 def test_noise_of_exact_matches_is_nothing():
     assert _noise(np.zeros(50), 1.0) == 0.0
 
@@ -444,6 +587,31 @@ def test_papers_ransac_is_seeded():
     ]
     np.testing.assert_array_equal(F[0], F[1])
     assert not np.array_equal(F[0], F[2])
+
+
+def test_papers_ransac_takes_eight_exact_matches_and_no_fewer_that_agree():
+    X = true_matches(0)[:8]
+    asked = {"threshold": 1.0, "confidence": 0.99, "max_iters": 200, "seed": 0}
+    found = eight_point_ransac(X, **asked)
+    assert found.votes == (8.0,)
+    assert sampson_distance(found.F, X).max() < 1.0
+    chance = np.random.default_rng(0).uniform(0, 1000, (20, 4))
+    assert eight_point_ransac(chance, **{**asked, "threshold": 1e-6}) is None
+
+
+def test_papers_ransac_draws_without_repetition_from_many(monkeypatch):
+    seen = []
+
+    def recorded(samples):
+        seen.append(samples)
+        return np.tile(np.eye(3), (len(samples), 1, 1))
+
+    monkeypatch.setattr(_consensus, "eight_point", recorded)
+    X = np.arange(280.0).reshape(70, 4)
+    eight_point_ransac(X, threshold=1e-9, confidence=0.99, max_iters=500, seed=0)
+    rows = np.concatenate(seen)[:, :, 0] / 4
+    assert rows.shape == (500, 8)
+    assert all(len(set(row)) == 8 for row in rows)
 
 
 def test_papers_ransac_draws_without_repetition(monkeypatch):
