@@ -12,6 +12,7 @@ from cv_densityf._epipolar import (
     Frame,
     eight_point,
     essential_ratio,
+    middle,
     point_line_squared,
     polish,
     shift,
@@ -118,7 +119,7 @@ def search(
     """
     n = len(X)
     # Far from the origin the float32 that cv2 draws with would eat the pixels.
-    centre = X.mean(axis=0)
+    centre, _ = middle(X)
     X = X - centre
     order = np.argsort(-reliability, kind="stable")
     points = X[order].astype(np.float32)
@@ -194,11 +195,6 @@ class _Pool:
         self._rng = rng
         self._frame = Frame(X)
         self._ballot = _Ballot(X, reliability)
-        # The reliable matches show where the images are, and how large.
-        seen = X[reliable]
-        centre = seen.mean(axis=0)
-        self._centred = shift(centre[:2]), shift(centre[2:])
-        self._image_size = float(np.sqrt(12.0 * ((seen - centre) ** 2).mean()))
         self._G: Floats = np.empty((0, 3, 3))
         self._squared: Floats = np.empty((0, len(X)))
         self._sizes: Floats = np.empty(0)
@@ -226,10 +222,8 @@ class _Pool:
     def _poll(self, G: Floats) -> tuple[Floats, Floats]:
         """Squared residuals (m, n) of hypotheses and the votes for them (m,)."""
         squared = self._frame.sampson(G)
-        first, second = self._centred
-        F = second.T @ self._frame.leave(G) @ first
         # The root: odd pixels or a cropped image should not decide.
-        credit = np.sqrt(essential_ratio(F, self._image_size))
+        credit = np.sqrt(essential_ratio(G))
         return squared, self._ballot.count(squared, self.working) * credit
 
     def adapt(self) -> None:

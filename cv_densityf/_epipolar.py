@@ -100,16 +100,15 @@ _SQUARE[_ROWS, _COLUMNS] = _SQUARE[_COLUMNS, _ROWS] = np.arange(45)
 class Frame:
     """Matches in coordinates that keep least squares well conditioned.
 
-    Both images are centred and divided by the *same* scale (the root mean square distance from the
-    centroids), so that a residual in this frame is a residual in pixels times ``scale``. Hartley,
-    "In defense of the eight-point algorithm" (1997).
+    Both images are centred and divided by the *same* scale, so that a residual in this frame is a
+    residual in pixels times ``scale``. Hartley, "In defense of the eight-point algorithm" (1997);
+    here without what lies far out.
     """
 
     __slots__ = ("_first", "_second", "homogeneous1", "homogeneous2", "outer", "products", "scale")
 
     def __init__(self, X: Floats) -> None:
-        centre = X.mean(axis=0)
-        spread = np.sqrt(((X - centre) ** 2).mean())
+        centre, spread = middle(X)
         self.scale = 1.0 / spread if spread > 0 else 1.0
         Z = (X - centre).T * self.scale
         ones = np.ones((1, len(X)))
@@ -155,12 +154,28 @@ class Frame:
         return algebraic * algebraic / (norm * self.scale**2 + _TINY)
 
 
+def middle(X: Floats) -> tuple[Floats, float]:
+    """Centroid (4,) of the matches and standard deviation about it, but for matches far out."""
+    away = np.abs(X - np.median(X, axis=0)).max(axis=1)
+    # Three quarters and not half, since half may be copies of one match.
+    most = 3 * len(X) // 4
+    near = X[away <= _FAR * np.partition(away, most)[most]]
+    centre = near.mean(axis=0)
+    spread = float(np.sqrt(((near - centre) ** 2).mean()))
+    if spread > 0:
+        return centre, spread
+    centre = X.mean(axis=0)
+    return centre, float(np.sqrt(((X - centre) ** 2).mean()))
+
+
 def shift(by: Floats) -> NDArray[np.float64]:
     """Matrix that moves homogeneous points by a vector (2,)."""
     return np.array([[1.0, 0.0, by[0]], [0.0, 1.0, by[1]], [0.0, 0.0, 1.0]])
 
 
 _TINY = 1e-300
+#: Matches this many times as far out as three quarters of them cannot be in the image.
+_FAR = 5.0
 #: Generators of the rotations about the three axes.
 _SKEW = np.zeros((3, 3, 3))
 _SKEW[0, 2, 1] = _SKEW[1, 0, 2] = _SKEW[2, 1, 0] = 1.0
@@ -177,7 +192,7 @@ _ENTRY_GAIN = np.stack([_FOCAL_SQUARED, _FOCAL_SQUARED, _ONES])
 _COFACTOR_GAIN = np.stack([_FOCAL_SQUARED, _FOCAL_SQUARED, _FOCAL_SQUARED**2])
 
 
-def essential_ratio(F: Floats, image_size: float) -> NDArray[np.float64]:
+def essential_ratio(F: Floats, image_size: float = np.sqrt(12.0)) -> NDArray[np.float64]:
     """How nearly two ordinary cameras can have these fundamental matrices, in [0, 1].
 
     With square pixels and the principal point in the middle of the image, ``K'^T F K`` is an
@@ -191,7 +206,7 @@ def essential_ratio(F: Floats, image_size: float) -> NDArray[np.float64]:
     F : array, shape (m, 3, 3)
         Matrices of rank 2, in pixels from the middle of either image.
     image_size : float
-        Pixels.
+        Pixels. The default is that of points spread evenly, in a `Frame`.
     """
     zoom = np.array([image_size, image_size, 1.0])
     U, S, Vt = np.linalg.svd(F * np.outer(zoom, zoom))

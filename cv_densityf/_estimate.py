@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cv_densityf._consensus import eight_point_ransac, refine, search
 from cv_densityf._engine import Robust, method_flag, method_name
-from cv_densityf._epipolar import inlier_mask
+from cv_densityf._epipolar import inlier_mask, middle
 from cv_densityf._prefilter import contrast_support, paper_support
 from cv_densityf._stopwatch import Stopwatch
 
@@ -163,7 +163,7 @@ def _estimate(
     watch.lap("density")
     threshold = robust.threshold
     if robust.rule == "lmeds":  # makes a threshold of its own, whatever the unit of the points
-        threshold = _LMEDS_THRESHOLD * float(np.sqrt(((Z - Z.mean(axis=0)) ** 2).mean()))
+        threshold = _LMEDS_THRESHOLD * middle(Z)[1]
     asked: dict[str, Any] = {
         "threshold": threshold,
         "confidence": robust.confidence,

@@ -194,7 +194,7 @@ def test_cameras_that_can_exist_win_over_a_few_more_votes(seed, monkeypatch):
         return pool.best
 
     assert winner() == 0
-    monkeypatch.setattr(_consensus, "essential_ratio", lambda F, size: np.ones(len(F)))
+    monkeypatch.setattr(_consensus, "essential_ratio", lambda F: np.ones(len(F)))
     assert winner() == 1
 
 
