@@ -57,6 +57,13 @@ _POLISH_STEPS = 3
 _REFINE_SIGMAS = 3.0
 _REFINE_STEPS = 2
 _NARROWEST = 0.1
+#: Hypotheses of a part of the matches that the others vote on.
+_FINALISTS = 3
+#: The winner has a way to go from where the part left it: in strides of this many steps of the
+#: polish, for wrong matches make them short, at a width of this many robust standard deviations.
+_STRIDES = 10
+_STRIDE = 3.0
+_STRIDE_SIGMAS = 1.4
 #: Noise may exceed the caller's threshold; residuals beyond this many of it are wrong matches.
 _WIDEST = 3.0
 #: A working threshold of this many robust standard deviations of the residuals lets nearly every
@@ -87,6 +94,7 @@ def search(
     seed: int,
     watch: Stopwatch,
     scores: Floats | None = None,
+    others: Floats | None = None,
 ) -> Consensus | None:
     """Search for the fundamental matrix that the reliable and well spread matches vote for.
 
@@ -111,6 +119,9 @@ def search(
     scores : array, shape (n,), optional
         The caller's trust in each match: one more draw takes its samples in this order, whatever
         the density says.
+    others : array, shape (k, 4), optional
+        Matches that are not searched: with the rest they vote on the best hypotheses, and polish
+        the winner.
 
     Returns
     -------
@@ -164,7 +175,7 @@ def search(
             return None
         for _ in range(_LOCAL_ROUNDS):
             pool.optimise()
-    F = pool.refined_best()
+    F = pool.refined_best() if others is None else pool.before(others - centre).settled_best()
     F = shift(-centre[2:]).T @ F @ shift(-centre[:2])
     watch.lap("polish")
     again = ", found again by another" if pool.agrees() else ""
@@ -273,11 +284,33 @@ class _Pool:
         best = self._G[self.best]
         return _refined(self._frame, best, self._reliable, self.threshold)
 
+    def before(self, others: Floats) -> _Pool:
+        """Put the best hypotheses, of different inliers, to more matches, all equal."""
+        inliers = (self._squared < self.working**2).astype(np.float32)
+        sizes = inliers.sum(axis=1)
+        chosen: list[int] = []
+        for i in np.argsort(-self.votes, kind="stable").tolist():
+            common = inliers[chosen] @ inliers[i]
+            if (common < _AGREEMENT * (sizes[chosen] + sizes[i] - common)).all():
+                chosen.append(i)
+            if len(chosen) == _FINALISTS:
+                break
+        X = np.concatenate([self._X, others])
+        wider = _Pool(X, np.ones(len(X)), self._reliable, self.threshold, self._rng)
+        wider.working = self.working
+        wider.add(self._frame.leave(self._G[chosen]), np.zeros(len(chosen)))
+        return wider
 
-def refine(F: Floats, X: Floats, reliable: Ints, threshold: float) -> NDArray[np.float64]:
-    """Polish F (3, 3) on the matches X (n, 4) at the noise of the rows in ``reliable``."""
-    frame = Frame(X)
-    return _refined(frame, frame.enter(F[None])[0], reliable, threshold)
+    def settled_best(self) -> NDArray[np.float64]:
+        """Polish the best hypothesis as long as it moves, then as always; in pixels, (3, 3)."""
+        G = self._G[[self.best]]
+        noise = _noise(self._squared[self.best, self._reliable], self.threshold)
+        width = max(_STRIDE_SIGMAS * noise, _NARROWEST * self.threshold)
+        for _ in range(_STRIDES):
+            step = polish(self._frame, G, [width])
+            step *= np.sign(np.sum(step * G))
+            G = G + _STRIDE * (step - G)
+        return _refined(self._frame, step[0], self._reliable, self.threshold)
 
 
 def _refined(frame: Frame, G: Floats, reliable: Ints, threshold: float) -> NDArray[np.float64]:
@@ -337,7 +370,8 @@ def _cells(points: Floats) -> tuple[Ints, Ints]:
     side = max(float((points.max(axis=0) - low).max()), 1e-9)
     column = np.minimum((points - low) * (_GRID / side), _GRID - 1).astype(np.intp)
     cell = column[:, 0] * _GRID + column[:, 1]
-    order = np.argsort(cell, kind="stable")
+    # Of so small integers numpy sorts by their digits.
+    order = np.argsort(cell.astype(np.uint16), kind="stable")
     cell = cell[order]
     return order, np.flatnonzero(np.concatenate([[True], cell[1:] != cell[:-1]]))
 

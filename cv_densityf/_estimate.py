@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from numbers import Integral, Real
 from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cv_densityf._consensus import eight_point_ransac, refine, search
+from cv_densityf._consensus import eight_point_ransac, search
 from cv_densityf._engine import Robust, method_flag, method_name
 from cv_densityf._epipolar import inlier_mask, middle
 from cv_densityf._prefilter import contrast_support, paper_support
@@ -28,7 +28,7 @@ DENSITIES = get_args(Density)
 MIN_FILTERED = 15
 #: More matches than this do not help to find F: a seeded, well spread part of this size searches.
 MAX_SEARCHED = 5_000
-#: They do help to refine it, up to what memory should bear.
+#: They do help to choose and to measure it, up to what memory should bear.
 MAX_REFINED = 100_000
 #: A part is spread over cells of the first image, and in each of them over cells of the second:
 #: this many to the longer side.
@@ -178,11 +178,12 @@ def _estimate(
             else:
                 if trust is None and robust.best_first:
                     trust = -rows.astype(np.float64)
-                found = search(Z, r, watch=watch, scores=trust, **asked)
-                if found is not None and len(heard) > len(rows):
-                    reliable = heard.searchsorted(rows[support])
-                    found = replace(found, F=refine(found.F, X[heard], reliable, threshold))
-                    watch.lap("polish")
+                others = None
+                if len(heard) > len(rows):
+                    searched = np.zeros(n, dtype=bool)
+                    searched[rows] = True
+                    others = X[heard[~searched[heard]]]
+                found = search(Z, r, watch=watch, scores=trust, others=others, **asked)
         except np.linalg.LinAlgError:
             found = None
     if found is None:

@@ -203,7 +203,7 @@ def findFundamentalMat(
     On the default path the threshold, the confidence and the seed of ``params`` count, its sampler
     only as far as PROSAC's means that the rows come best first. A draw ends after at most
     ``maxIters`` samples and after 1,000; there are up to eleven draws. Of more than 5,000 matches a
-    seeded 5,000 are searched; up to 100,000 refine the result, and the mask is over all.
+    seeded 5,000 are searched; up to 100,000 choose and refine the result, and the mask is over all.
 
     Deliberate differences from cv2: where ``FM_RANSAC`` and ``FM_LMEDS`` find no model cv2 returns
     uninitialised memory as the mask and leaves a given ``mask`` as it was; here both are zeros.

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
+from benchmarks.scenes import make_scene
 from cv_densityf import (
     Estimate,
     FundamentalMatrixEstimator,
@@ -645,6 +646,19 @@ def test_matches_beyond_the_search_refine_the_result(monkeypatch):
             estimate = estimate_fundamental(scene.points1, scene.points2)
             errors.append(np.median(sampson_distance(estimate.F, X)))
     assert np.mean(all_rows) < 0.7 * np.mean(searched)
+
+
+def test_all_matches_vote_on_what_a_part_has_found(monkeypatch):
+    """Nine of ten right matches are on one wall, and 80 of the part's 600 are right."""
+    monkeypatch.setattr("cv_densityf._estimate.MAX_SEARCHED", 600)
+    errors = {1: [], 3: []}
+    for finalists, found in errors.items():
+        monkeypatch.setattr("cv_densityf._consensus._FINALISTS", finalists)
+        for seed in range(20):
+            pair = make_scene("dominant_plane", 6000, 0.15, 0.5, seed)
+            found.append(pair.error(estimate(pair.X).F))
+    chosen, voted = np.array(errors[1]), np.array(errors[3])
+    assert (voted < 0.95 * chosen).sum() > 4 + (voted > 1.05 * chosen).sum()
 
 
 def test_an_f_that_fits_next_to_nothing_is_not_ours():
