@@ -159,13 +159,10 @@ def middle(X: Floats) -> tuple[Floats, float]:
     away = np.abs(X - np.median(X, axis=0)).max(axis=1)
     # Three quarters and not half, since half may be copies of one match.
     most = 3 * len(X) // 4
-    near = X[away <= _FAR * np.partition(away, most)[most]]
+    reach = _FAR * np.partition(away, most)[most]
+    near = X[away <= reach] if reach > 0 else X
     centre = near.mean(axis=0)
-    spread = float(np.sqrt(((near - centre) ** 2).mean()))
-    if spread > 0:
-        return centre, spread
-    centre = X.mean(axis=0)
-    return centre, float(np.sqrt(((X - centre) ** 2).mean()))
+    return centre, float(np.sqrt(((near - centre) ** 2).mean()))
 
 
 def shift(by: Floats) -> NDArray[np.float64]:
