@@ -366,6 +366,48 @@ def test_draws_near_the_best_take_what_lies_within_eight_thresholds():
         np.testing.assert_array_equal(pool.near_best(width), distance < 2.0 * width)
 
 
+def test_matches_near_the_best_are_drawn_from_however_unreliable(monkeypatch):
+    scene = scene_of(0, inlier_ratio=0.5)
+    rank = np.random.default_rng(0).uniform(0, 0.1, 600)
+    # Half of the right matches come first, the others last.
+    unreliable = scene.inliers & (np.arange(600) % 2 == 1)
+    reliability = 0.5 + 0.4 * (scene.inliers & ~unreliable) - 0.4 * unreliable + rank
+    seen = spied_draws(monkeypatch, _consensus.draw)
+    monkeypatch.setattr(_Pool, "agrees", lambda pool: False)
+    find(scene.X, reliability)
+    X = (scene.X - scene.X.mean(axis=0)).astype(np.float32)
+    row_of = {row.tobytes(): i for i, row in enumerate(X)}
+    parts = [{row_of[row.tobytes()] for row in points} for points, *_ in seen]
+    wanted = set(np.flatnonzero(unreliable))
+    near = [part for part in parts if len(part) < 550 and len(part & wanted) > 0.8 * len(wanted)]
+    assert len(near) >= 2
+    for part in near:
+        assert scene.inliers[list(part)].mean() > 0.7
+
+
+@pytest.mark.parametrize("factor", [0.01, 300.0])
+def test_the_unit_of_length_hardly_matters_to_the_search(factor):
+    errors = []
+    for seed in SEEDS:
+        X, truth = scene_of(seed).X, true_matches(seed)
+        here = sampson_distance(find(X).F, truth).mean()
+        there = sampson_distance(find(factor * X, threshold=factor).F, factor * truth).mean()
+        errors.append([here, there / factor])
+    here, there = np.median(errors, axis=0)
+    assert there < 1.2 * here
+
+
+def test_local_optimisation_is_no_second_opinion():
+    scene = scene_of(0, inlier_ratio=0.6)
+    X = scene.X - scene.X.mean(axis=0)
+    pool = _Pool(X, np.ones(600), np.arange(600), 1.0, np.random.default_rng(0))
+    pool.add(eight_point(X[None, scene.inliers]), [50])
+    for _ in range(3):
+        pool.optimise()
+    assert len(pool) == 4
+    assert not pool.agrees()
+
+
 @pytest.mark.parametrize(
     ("common", "more", "sizes", "agree"),
     [
@@ -509,6 +551,13 @@ def test_noise_is_the_standard_deviation_of_the_right_ones_residuals(sigma, n_wr
 def test_noise_of_next_to_no_residuals_is_of_the_order_of_the_threshold():
     for squared in (np.array([]), np.full(30, 1e6)):
         assert 0.1 < _noise(squared, 1.0) <= 1.0
+
+
+def test_noise_among_wrong_matches_nearby():
+    """As many of them as of right ones, within a few deviations on average."""
+    rng = np.random.default_rng(0)
+    r = np.concatenate([rng.normal(0, 0.2, 2000), rng.uniform(-3, 3, 2000)])
+    assert _noise(r**2, 1.0) == pytest.approx(0.2, rel=0.25)
 
 
 def test_noise_is_of_residuals_within_three_thresholds():

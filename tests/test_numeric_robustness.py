@@ -161,10 +161,12 @@ ADDED = {
     "a right match 500 times": lambda X, seed: np.tile(X[:1], (500, 1)),
     "a wrong match 500 times": lambda X, seed: np.tile(wrong(seed, 1), (500, 1)),
     "ten wrong matches 50 times": lambda X, seed: np.tile(wrong(seed, 10), (50, 1)),
-    "one match far away": lambda X, seed: wrong(seed, 1, -1e4, 1e4),
-    "25 matches far away": lambda X, seed: wrong(seed, 25, -1e4, 1e4),
-    "25 matches far away in one image": lambda X, seed: np.hstack(
-        [wrong(seed, 25)[:, :2], wrong(seed, 25, -1e4, 1e4)[:, 2:]]
+    **{
+        f"{n} up to {far:g} px away": lambda X, seed, n=n, far=far: wrong(seed, n, -far, far)
+        for n, far in ((1, 1e4), (25, 1e4), (25, 1e5), (25, 1e6), (1, 1e8), (25, 1e9), (25, 1e30))
+    },
+    "25 far away in one image": lambda X, seed: np.hstack(
+        [wrong(seed, 25)[:, :2], wrong(seed, 25, -1e6, 1e6)[:, 2:]]
     ),
     "25 matches at no place": lambda X, seed: np.full((25, 4), np.nan),
 }
