@@ -78,6 +78,9 @@ class DensityPeaks(ClusterMixin, BaseEstimator):  # type: ignore[misc]
     kernel : {"cutoff", "gaussian"}, default="cutoff"
         Density as a count of the points nearer than ``dc``, or as a sum of Gaussians of that
         width, which has fewer ties in small sets.
+    sample_size : int >= 2 or None, default=None
+        Estimate densities from this many of the points, where counting all takes too long: see
+        `cv_densityf.density_peaks` for the error. None uses all.
     halo : bool, default=False
         Label the halo of the clusters -1.
 
@@ -133,6 +136,7 @@ class DensityPeaks(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         "dc": [Interval(Real, 0, None, closed="neither"), None],
         "dc_percent": [Interval(Real, 0, 100, closed="right")],
         "kernel": [StrOptions({"cutoff", "gaussian"})],
+        "sample_size": [Interval(Integral, 2, None, closed="left"), None],
         "halo": ["boolean"],
     }
 
@@ -144,6 +148,7 @@ class DensityPeaks(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         dc: float | None = None,
         dc_percent: float = 2.0,
         kernel: str = "cutoff",
+        sample_size: int | None = None,
         halo: bool = False,
     ) -> None:
         self.n_clusters = n_clusters
@@ -151,6 +156,7 @@ class DensityPeaks(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         self.dc = dc
         self.dc_percent = dc_percent
         self.kernel = kernel
+        self.sample_size = sample_size
         self.halo = halo
 
     def fit(self, X: ArrayLike, y: Any = None) -> Self:
@@ -183,6 +189,7 @@ class DensityPeaks(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             dc=self.dc,
             dc_percent=self.dc_percent,
             kernel="gaussian" if self.kernel == "gaussian" else "cutoff",
+            sample_size=self.sample_size,
         )
         centers = (
             peaks.centers(alpha=self.alpha)

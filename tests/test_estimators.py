@@ -68,7 +68,7 @@ class AnyWidthFilter(DensityPeaksFilter):
 
 BATTERY = [
     DensityPeaks(),
-    DensityPeaks(n_clusters=3, kernel="gaussian", halo=True),
+    DensityPeaks(n_clusters=3, kernel="gaussian", sample_size=20, halo=True),
     DensityPeaksFilter("paper"),
     AnyWidthFilter("contrast"),
     AnyWidthEstimator(),
@@ -475,6 +475,14 @@ def test_clusterer_is_density_peaks(scene, options):
     assert (marked == -1).any()
     assert DensityPeaks(dc=50.0).fit(X).dc_ == 50
     assert not hasattr(clusterer, "predict")
+
+
+def test_clusterer_counts_in_a_sample(scene):
+    sampled = DensityPeaks(sample_size=50).fit(scene.X)
+    np.testing.assert_array_equal(sampled.rho_, density_peaks(scene.X, sample_size=50).rho)
+    assert (sampled.rho_ != DensityPeaks().fit(scene.X).rho_).any()
+    with pytest.raises(ValueError, match="'sample_size' parameter of DensityPeaks"):
+        DensityPeaks(sample_size=1).fit(scene.X)
 
 
 def test_more_clusters_than_points():
