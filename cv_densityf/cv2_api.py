@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import math
+from time import perf_counter
 from typing import Any, NamedTuple, overload
 
 import cv2
@@ -12,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cv_densityf._engine import Robust, is_usac, original
 from cv_densityf._epipolar import inlier_mask
-from cv_densityf._estimate import MIN_FILTERED, Density, Estimate, check_density, run
+from cv_densityf._estimate import LOG, MIN_FILTERED, Density, Estimate, check_density, run
 from cv_densityf._overloads import Call, resolve
 from cv_densityf._points import as_array, as_matches, as_umat, n_points
 
@@ -241,16 +243,18 @@ def find(
     scores: ArrayLike | None = None,
 ) -> tuple[Any, Estimate | None]:
     """Answer a call of cv2's function, and say how: None where the answer is cv2's own."""
+    start = perf_counter()
     check_density(density, alpha, dc_percent)
     call = resolve(args, kwargs)
     if call is None:
-        return original(*args, **kwargs), None
+        return _passed_on(original(*args, **kwargs), None, density, start)
     usac = call.params is not None or is_usac(call.method)
     points1, points2 = as_array(call.points1), as_array(call.points2)
     n = None if points1 is None or points2 is None else _common_length(points1, points2, usac)
     trust = None if scores is None else _check_scores(scores, n)
     if points1 is None or points2 is None or n is None:
-        return _cv2s_answer(call, None, usac, args, kwargs), None
+        answer = _cv2s_answer(call, None, usac, args, kwargs)
+        return _passed_on(answer, None, density, start)
 
     slot = _mask_slot(call, n, usac)
     ordinary = n >= MIN_FILTERED and _is_ordinary(call)
@@ -258,12 +262,13 @@ def find(
         if _OPENCV_5 and n > _GRAPH_CUT_MAX and _cuts_graph(call):
             args, kwargs = _without_graph_cut(call), {}
         try:
-            return _cv2s_answer(call, n, usac, args, kwargs), None
+            answer = _cv2s_answer(call, n, usac, args, kwargs)
+            return _passed_on(answer, n, density, start)
         except cv2.error as error:
             if slot is None or not _is_solver_failure(error, call, n, usac):
                 raise
         if not ordinary:
-            return _no_model(call, n, usac, slot), None
+            return _passed_on(_no_model(call, n, usac, slot), n, density, start)
     X = as_matches(points1, points2, n, usac)
     robust = Robust(
         call.method,
@@ -290,6 +295,26 @@ def find(
         F /= F[2, 2]
         mask = inlier_mask(F, X, robust.rule, robust.threshold)
     return (F, slot.deliver(mask)), estimate
+
+
+def _passed_on(answer: Any, n: int | None, density: str, start: float) -> tuple[Any, None]:
+    """Tell the log of an answer that is cv2's own; `run` tells of the others."""
+    if LOG.isEnabledFor(logging.DEBUG):
+        if n is None:
+            why = "only cv2 can read its arguments"
+        elif density == "off":
+            why = "density is off"
+        elif n < MIN_FILTERED:
+            why = f"fewer than {MIN_FILTERED} matches"
+        else:
+            why = "its method, numbers or mask are not for the density pipeline"
+        LOG.debug(
+            "%s matches, engine cv2, %.1f ms: cv2's own call, since %s",
+            "unread" if n is None else n,
+            1e3 * (perf_counter() - start),
+            why,
+        )
+    return answer, None
 
 
 class _MaskSlot(NamedTuple):

@@ -247,6 +247,24 @@ def test_few_points_are_cv2s_own_call(n, method):
         assert_same(ours, expected)
 
 
+def test_the_log_tells_of_cv2s_own_calls(caplog):
+    lists = P1.tolist()
+    with caplog.at_level("DEBUG", "cv_densityf"):
+        findFundamentalMat(P1, P2, density="off")
+        findFundamentalMat(P1[:9], P2[:9], cv2.FM_8POINT)
+        findFundamentalMat(P1, P2, cv2.FM_8POINT)
+        findFundamentalMat(cv2.Mat(P1), P2)
+        with pytest.raises(cv2.error):
+            findFundamentalMat(lists, lists)
+    lines = [record.getMessage() for record in caplog.records]
+    starts = ["150 matches", "9 matches", "150 matches", "unread matches"]
+    ends = ["density is off", "fewer than 15 matches", "density pipeline", "read its arguments"]
+    assert len(lines) == len(starts)
+    for line, start, end in zip(lines, starts, ends, strict=True):
+        assert line.startswith(f"{start}, engine cv2, ")
+        assert line.endswith(end)
+
+
 UNUSUAL = [
     *((m, *numbers) for m in (1, 2, 0, 3, 9, 16, 39, -8) for numbers in [(1.0, 0.99, 300)]),
     *((8, t, 0.99, 300) for t in (0.0, -1.0, np.inf)),
