@@ -26,7 +26,7 @@ from tqdm import tqdm
 from benchmarks.data import TRUTH_BAND, Pair, load_pairs, move_onto
 from benchmarks.metrics import LOST, epipolar_distance, sampson_distance, usable
 from benchmarks.rendered import SCENES, render_pair
-from benchmarks.report import _finite, _table
+from benchmarks.report import _LOST, _finite, _table
 from benchmarks.run import one_thread
 from benchmarks.scenes import make_scene
 from cv_densityf import datasets
@@ -73,6 +73,8 @@ SWEEP_ALPHAS = (0.001, 0.002, 0.005, 0.011, 0.02, 0.04, 0.08, 0.16, 0.32)
 SWEEP_THRESHOLD = 1.0
 #: The cut of the sweep and of the pictures.
 SHOWN = "all matches"
+#: Width of the pictures, inches: that of a page, so that their letters are as large as its text.
+PAGE = 10
 #: A match this close to F_0, pixels, counts as right.
 RIGHT = 2.2
 PROPOSED, PROPOSED_CV2, DEFAULT = "proposed", "proposed, cv2's RANSAC", "default"
@@ -451,7 +453,7 @@ def _spread(values: Iterable[float], digits: int = 3) -> str:
 
 
 def _short(value: float, digits: int) -> str:
-    return "lost" if np.isinf(value) else f"{value:.{digits}f}"
+    return _LOST if np.isinf(value) else f"{value:.{digits}f}"
 
 
 def _pick(trials: Iterable[Trial], source: str, method: str, threshold: float) -> list[Trial]:
@@ -605,8 +607,9 @@ def _limits_table(limits: Sequence[Trial]) -> str:
 def _plot_sweep(path: Path, swept: Sequence[Swept]) -> None:
     """Error, matches kept and time against alpha, real and synthetic; RANSAC dashed."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullLocator
 
-    figure = Figure(figsize=(13, 4.2), layout="constrained")
+    figure = Figure(figsize=(PAGE, 4.8), layout="constrained")
     error, share, speed = figure.subplots(1, 3)
     for source, color in (("real", "#0072B2"), ("synthetic", "#D55E00")):
         rows = [s for s in swept if s.trial.source == source]
@@ -639,22 +642,27 @@ def _plot_sweep(path: Path, swept: Sequence[Swept]) -> None:
         ]
         speed.plot(alphas, ratios, "o-", color=color, label=source)
     error.set(yscale="log", ylabel="error on truth points, px")
-    share.set(ylim=(0, 1.62), yticks=np.arange(0, 1.1, 0.2), ylabel="share")
-    speed.axhline(1, color="black", ls="--", lw=1)
+    share.set(ylim=(0, 1.03), ylabel="share")
+    speed.axhline(1, color="black", ls="--", lw=1, label="RANSAC")
     speed.set(yscale="log", ylabel="time / RANSAC's")
+    for ax in (error, speed):
+        ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        ax.yaxis.set_major_formatter("{x:g}")
+        ax.yaxis.set_minor_locator(NullLocator())
     for ax in (error, share, speed):
         ax.set(xscale="log", xlabel="alpha")
+        ax.xaxis.set_major_formatter("{x:g}")
         ax.grid(alpha=0.25)
-        ax.legend(fontsize=8)
-    _save(figure, path, 80)
+        ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), fontsize=8.5, frameon=False)
+    _save(figure, path)
 
 
-def _save(figure: Any, path: Path, dpi: int) -> None:
+def _save(figure: Any, path: Path) -> None:
     """Write a PNG of 256 colours: photographs make it half as large."""
     from PIL import Image
 
     buffer = BytesIO()
-    figure.savefig(buffer, dpi=dpi)
+    figure.savefig(buffer, dpi=100)
     Image.open(buffer).convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE).save(path)
 
 
@@ -671,12 +679,16 @@ def _plot_pair(folder: Path, views: Views) -> None:
     kept = paper_support(X, alpha, DC_PERCENT)[1]
     ransac_inliers = RANSAC(X, threshold, alpha, 0).own
     own = _proposed(X, threshold, alpha, 0).own
-    for name, size in (("decision", (16, 7)), ("matches", (16, 6))):
-        figure = Figure(figsize=size, layout="constrained")
+    for name, height in (("decision", 5.0), ("matches", 4.1)):
+        figure = Figure(figsize=(PAGE, height), layout="constrained")
         ax = figure.add_subplot()
         if name == "decision":
             peaks = density_peaks(X, dc_percent=DC_PERCENT)
             plot_decision_graph(peaks, alpha=alpha, kept=kept, mask=ransac_inliers, ax=ax)
         else:
             plot_matches(*views.images, X[kept], mask=own[kept], ax=ax)
-        _save(figure, folder / f"paper-{views.source}-{name}.png", 62)
+        # The package's own legend is for wider figures.
+        ax.legend(
+            loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False, markerscale=1.4
+        )
+        _save(figure, folder / f"paper-{views.source}-{name}.png")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
@@ -36,6 +37,10 @@ PACKAGES = (
     "pydegensac",
     "pymagsac",
 )
+
+#: In a table, an error that is infinite.
+_LOST = "lost"
+_TABLE = re.compile(r"^\|.*(?:\n\|.*)*", re.MULTILINE)
 
 Rows = list[Record]
 
@@ -106,8 +111,46 @@ def _by_method(rows: Rows) -> dict[str, Rows]:
 
 
 def _table(header: Sequence[str], body: Iterable[Sequence[str]]) -> str:
-    lines = [header, ["---"] + ["--:"] * (len(header) - 1), *body]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    """Figures to the right, the first column and words to the left."""
+    body = list(body)
+    columns = [[row[k] for row in body] for k in range(1, len(header))]
+    marks = ["---", *("---" if any(map(_is_words, column)) else "--:" for column in columns)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in (header, marks, *body))
+
+
+def _is_words(cell: str) -> bool:
+    return cell[:1].isalpha() and not cell.startswith(_LOST)
+
+
+def fill(page: str | Path, report: str) -> None:
+    """Bring the tables of a page up to date, each below a comment with its title in a report.
+
+    Parameters
+    ----------
+    page : path
+        Markdown; ``<!-- table: TITLE -->`` stands before each table to be replaced.
+    report : str
+        Markdown; ``## TITLE`` stands somewhere before its table.
+
+    Raises
+    ------
+    ValueError
+        If the report has no table of that title, or the page none below the comment.
+    """
+    tables = {}
+    for section in report.split("\n## ")[1:]:
+        if table := _TABLE.search(section):
+            tables[section.splitlines()[0]] = table[0]
+    # From comment to comment: what comes before the first has none.
+    text, *parts = re.split(r"(?m)^(?=<!-- table: )", Path(page).read_text("utf-8"))
+    for part in parts:
+        title = part.splitlines()[0].removeprefix("<!-- table: ").removesuffix(" -->")
+        if title not in tables:
+            raise ValueError(f"{page}: no table {title!r} in the report; it has {list(tables)}")
+        if not _TABLE.search(part):
+            raise ValueError(f"{page}: there is no table below {part.splitlines()[0]}")
+        text += _TABLE.sub(lambda _, new=tables[title]: new, part, count=1)
+    Path(page).write_text(text, encoding="utf-8")
 
 
 def _share(value: float) -> str:
@@ -115,7 +158,7 @@ def _share(value: float) -> str:
 
 
 def _pixels(value: float) -> str:
-    return "lost" if np.isinf(value) else f"{value:.2f}"
+    return _LOST if np.isinf(value) else f"{value:.2f}"
 
 
 def _overall(rows: Rows) -> str:
