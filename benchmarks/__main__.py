@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 from collections import defaultdict
 from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from tqdm import tqdm
@@ -93,6 +96,7 @@ def _parser() -> argparse.ArgumentParser:
     growth.add_argument("--scene", choices=KINDS, default="clusters")
     growth.add_argument("--scenes", type=int, default=5, metavar="N", help="per size (default 5)")
     growth.add_argument("--plot", metavar="FILE", help="draw time over N, both logarithmic")
+    growth.add_argument("--page", metavar="FILE", help="bring the tables of this page up to date")
     growth.set_defaults(run=_scale)
 
     paper = commands.add_parser("paper", help="the tables and figures of Wu and Wan")
@@ -101,6 +105,9 @@ def _parser() -> argparse.ArgumentParser:
     paper.add_argument("--out", metavar="DIR", help="write the report, every trial and the plots")
     paper.add_argument(
         "--seeds", type=int, default=5, metavar="N", help="draws of each pair's matches (default 5)"
+    )
+    paper.add_argument(
+        "--page", metavar="FILE", help="bring this page's tables, and images/ beside it, up to date"
     )
     paper.set_defaults(run=_paper)
 
@@ -207,12 +214,22 @@ def _stages(args: argparse.Namespace) -> int:
 
 
 def _scale(args: argparse.Namespace) -> int:
-    print(scale(args.n, args.cluster_n, args.scenes, args.scene, args.plot))
+    text = scale(args.n, args.cluster_n, args.scenes, args.scene, args.plot)
+    print(text)
+    if args.page:
+        report.fill(args.page, text)
     return 0
 
 
 def _paper(args: argparse.Namespace) -> int:
-    print(reproduce(args.data, args.out, args.seeds, args.quick))
+    with TemporaryDirectory() as scratch:
+        folder = Path(args.out or scratch)
+        text = reproduce(args.data, folder, args.seeds, args.quick)
+        print(text)
+        if args.page:
+            report.fill(args.page, text)
+            for picture in folder.glob("paper-*.png"):
+                shutil.copy(picture, Path(args.page).parent / "images")
     return 0
 
 

@@ -222,14 +222,14 @@ def _cell_name(cell: Cell) -> str:
     return "/".join(map(str, cell))
 
 
-def reproduce(data: str | None, out: str | None, seeds: int, quick: bool) -> str:
+def reproduce(data: str | None, out: Path, seeds: int, quick: bool) -> str:
     """Run every experiment; return the report in markdown, and write it and the plots to ``out``.
 
     Parameters
     ----------
     data : str or None
         Folder of further real pairs.
-    out : str or None
+    out : path
         Folder for paper.md, paper.json and the plots.
     seeds : int
         Draws of each pair's matches.
@@ -259,15 +259,13 @@ def reproduce(data: str | None, out: str | None, seeds: int, quick: bool) -> str
             _limits_table(limits),
         ]
     )
-    if out is not None:
-        folder = Path(out)
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "paper.md").write_text(report + "\n", encoding="utf-8")
-        records = [_finite(asdict(t)) for t in trials]
-        (folder / "paper.json").write_text(json.dumps(records) + "\n", encoding="utf-8")
-        _plot_sweep(folder / "paper-alpha.png", sweep)
-        for source in ("real", "synthetic"):
-            _plot_pair(folder, next(v for v in views if v.source == source))
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "paper.md").write_text(report + "\n", encoding="utf-8")
+    records = [_finite(asdict(t)) for t in trials]
+    (out / "paper.json").write_text(json.dumps(records) + "\n", encoding="utf-8")
+    _plot_sweep(out / "paper-alpha.png", sweep)
+    for source in ("real", "synthetic"):
+        _plot_pair(out, next(v for v in views if v.source == source))
     return report
 
 

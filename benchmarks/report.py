@@ -138,7 +138,7 @@ def fill(page: str | Path, report: str) -> None:
         If the report has no table of that title, or the page none below the comment.
     """
     tables = {}
-    for section in report.split("\n## ")[1:]:
+    for section in f"\n{report}".split("\n## ")[1:]:
         if table := _TABLE.search(section):
             tables[section.splitlines()[0]] = table[0]
     # From comment to comment: what comes before the first has none.

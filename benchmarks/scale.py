@@ -19,6 +19,7 @@ from scipy.spatial.distance import cdist
 
 from benchmarks.data import Pair
 from benchmarks.peers import METHODS, Method, Settings, choose
+from benchmarks.report import _table
 from benchmarks.run import one_thread, warm_up
 from benchmarks.scenes import make_scene
 from cv_densityf import _estimate
@@ -32,6 +33,7 @@ RIVAL = "cv2:USAC_MAGSAC"
 CALLS = ("cv2:FM_RANSAC", RIVAL, "ours:FM_RANSAC", "ours:USAC_MAGSAC", "ours:USAC_ACCURATE")
 SEARCH_ALL = "ours:USAC_MAGSAC, searching all"
 FILTER = "contrast, reliability, kept"
+EXACT = "density_peaks"
 MATRIX = "density peaks, distance matrix"
 SAMPLE_SIZE = 20_000
 SAMPLED = f"density_peaks, sample_size={SAMPLE_SIZE:,}"
@@ -123,14 +125,17 @@ def scale(
         memory = {n: measure_memory(n, kind) for n in sorted({largest, max(numbers)})}
         parts += [
             "## Time, ms\n\n" + _times(calls, numbers),
-            f"## Time / {RIVAL}\n\n" + _ratios(calls, numbers),
+            f"## Time / {RIVAL}\n\n" + _times(calls, numbers, RIVAL),
             "## Error, px\n\n" + _errors(calls, numbers),
             *(["## Error / searching all matches\n\n" + _parts_table(parted)] if parted else []),
             "## Error on optical flow, px\n\n" + _errors(dense, list(dense[RIVAL].ms)),
             "## Peak memory over the input, MB\n\n" + _memory(memory),
         ]
     if cluster_numbers:
-        parts.append("## Clustering, ms\n\n" + _times(clustering, cluster_numbers))
+        parts += [
+            "## Clustering, ms\n\n" + _times(clustering, cluster_numbers),
+            f"## Clustering, time / {EXACT}\n\n" + _times(clustering, cluster_numbers, EXACT),
+        ]
         if clustering[SAMPLED].errors:
             title = "## Error of rho, |estimated / exact - 1|"
             parts.append(f"{title}\n\n{_errors(clustering, cluster_numbers)}")
@@ -242,7 +247,7 @@ def measure_clustering(numbers: Sequence[int], scenes: int, kind: str) -> dict[s
     from sklearn.cluster import HDBSCAN
 
     functions: dict[str, Callable[[Pair], object]] = {
-        "density_peaks": lambda pair: density_peaks(pair.X),
+        EXACT: lambda pair: density_peaks(pair.X),
         SAMPLED: lambda pair: density_peaks(pair.X, sample_size=SAMPLE_SIZE),
         MATRIX: lambda pair: matrix_density_peaks(pair.X),
         "sklearn HDBSCAN": lambda pair: HDBSCAN(min_cluster_size=10, copy=True).fit(pair.X),
@@ -252,7 +257,7 @@ def measure_clustering(numbers: Sequence[int], scenes: int, kind: str) -> dict[s
 
         functions["pydpc"] = lambda pair: Cluster(pair.X, autoplot=False)
     # Others that keep all distances meet the memory's end as well.
-    sizes = {"density_peaks": (0, FIT[1]), SAMPLED: (SAMPLE_SIZE + 1, np.inf)}
+    sizes = {EXACT: (0, FIT[1]), SAMPLED: (SAMPLE_SIZE + 1, np.inf)}
     sizes["sklearn HDBSCAN"] = (0, MAX_OTHERS)
     series = {name: Series() for name in functions}
     for n in numbers:
@@ -331,7 +336,7 @@ def measure_memory(n: int, kind: str) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "X.npy"
         np.save(path, pair.X)
-        for name in (*CALLS, "density_peaks" if n <= FIT[1] else SAMPLED):
+        for name in (*CALLS, EXACT if n <= FIT[1] else SAMPLED):
             # A process of its own: memory that was freed before would hide a peak.
             with context.Pool(1) as pool:
                 peaks[name] = pool.apply(_peak, (name, str(path)))
@@ -340,7 +345,7 @@ def measure_memory(n: int, kind: str) -> dict[str, float]:
 
 def _peak(name: str, path: str) -> float:
     def call(X: Floats) -> None:
-        if name in ("density_peaks", SAMPLED):
+        if name in (EXACT, SAMPLED):
             density_peaks(X, sample_size=SAMPLE_SIZE if name == SAMPLED else None)
             return
         pair = Pair(
@@ -366,37 +371,33 @@ def _status(name: str) -> int:
     return int(next(line for line in lines if line.startswith(name)).split()[1])
 
 
-def _table(header: Sequence[str], body: Iterable[Sequence[str]]) -> str:
-    lines = [header, ["---"] + ["--:"] * (len(header) - 1), *body]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
-
-
 def _cell(value: float, form: str) -> str:
     return "" if np.isnan(value) else format(value, form)
 
 
-def _times(series: Mapping[str, Series], numbers: Sequence[int]) -> str:
+def _times(
+    series: Mapping[str, Series], numbers: Sequence[int], reference: str | None = None
+) -> str:
+    """Give ms, or multiples of another's; in brackets what the matrix would take."""
     header = ["", *(f"N = {n:,}" for n in numbers), "exponent"]
     body = []
     for name, s in series.items():
-        cells = [_cell(s.time(n), ".1f") for n in numbers]
-        if name == MATRIX and s.ms:
-            last = max(s.ms)
-            cells = [
-                cell or f"({s.time(last) * (n / last) ** 2:.0f})"
-                for n, cell in zip(numbers, cells, strict=True)
-            ]
-        body.append([name, *cells, _cell(s.exponent, ".2f")])
+        row = [name]
+        for n in numbers:
+            ms, form = s.time(n), "{}"
+            if name == MATRIX and s.ms and np.isnan(ms):
+                last = max(s.ms)
+                ms, form = s.time(last) * (n / last) ** 2, "({})"
+            cell = _cell(ms, ".1f") if reference is None else _ratio(ms, series[reference].time(n))
+            row.append(form.format(cell) if cell else "")
+        body.append([*row, _cell(s.exponent, ".2f")])
     return _table(header, body)
 
 
-def _ratios(series: Mapping[str, Series], numbers: Sequence[int]) -> str:
-    rival = series[RIVAL]
-    body = (
-        [name, *(_cell(s.time(n) / rival.time(n), ".2f") for n in numbers)]
-        for name, s in series.items()
-    )
-    return _table(["", *(f"N = {n:,}" for n in numbers)], body)
+def _ratio(ms: float, reference: float) -> str:
+    """Two digits and no more, for times differ that much from run to run."""
+    ratio = ms / reference
+    return _cell(ratio, ".0f" if ratio >= 10 else ".1f" if ratio >= 1 else ".2f")
 
 
 def _errors(series: Mapping[str, Series], numbers: Sequence[int]) -> str:

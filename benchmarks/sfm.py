@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -22,9 +23,11 @@ from unittest.mock import patch
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from benchmarks import rendered
 from benchmarks.rendered import SCENES, SIZE, View, intrinsics
+from benchmarks.report import _table, fill
 from cv_densityf.colmap import verify_matches
 
 Floats = NDArray[np.float64]
@@ -210,24 +213,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.sfm", description=__doc__)
     parser.add_argument("--scenes", nargs="+", choices=ARC_SCENES, default=ARC_SCENES)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--page", metavar="FILE", help="bring the table of this page up to date")
     args = parser.parse_args(argv)
     header = (
         "scene", "matches", "verification", "pairs", "inlier matches", "registered", "points",
         "position, %", "rotation, deg", "time / COLMAP's",
     )  # fmt: skip
-    print(f"{N_VIEWS} views of {SIZE[0]} x {SIZE[1]}, {N_VIEWS * (N_VIEWS - 1) // 2} pairs\n")
-    print(f"| {' | '.join(header)} |\n|{' --- |' * 3}{' --: |' * 7}")
-    for name in args.scenes:
-        for kind, ratio in RATIOS.items():
-            with tempfile.TemporaryDirectory() as folder:
-                models = compare(name, ratio, Path(folder) / "sfm", args.seed)
-            own = models["pycolmap"].seconds
-            for verifier, m in models.items():
-                cells = (
-                    name, kind, verifier, m.pairs, m.inliers, m.registered, m.points,
-                    f"{m.position:.2f}", f"{m.rotation:.3f}", f"{m.seconds / own:.2f}",
-                )  # fmt: skip
-                print(f"| {' | '.join(map(str, cells))} |", flush=True)
+    body = []
+    for name, (kind, ratio) in tqdm(list(product(args.scenes, RATIOS.items())), unit="scene"):
+        with tempfile.TemporaryDirectory() as folder:
+            models = compare(name, ratio, Path(folder) / "sfm", args.seed)
+        own = models["pycolmap"].seconds
+        for verifier, m in models.items():
+            cells = (
+                name, kind, verifier, m.pairs, m.inliers, m.registered, m.points,
+                f"{m.position:.2f}", f"{m.rotation:.3f}", f"{m.seconds / own:.2f}",
+            )  # fmt: skip
+            body.append([str(cell) for cell in cells])
+    n_pairs = N_VIEWS * (N_VIEWS - 1) // 2
+    title = f"{N_VIEWS} views of {SIZE[0]} x {SIZE[1]}, {n_pairs} pairs"
+    text = f"## {title}\n\n{_table(header, body)}"
+    print(text)
+    if args.page:
+        fill(args.page, text)
     return 0
 
 

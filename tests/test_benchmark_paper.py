@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from importlib.util import find_spec
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,14 +15,17 @@ from benchmarks.__main__ import main
 from benchmarks.metrics import sampson_distance
 from benchmarks.scenes import make_scene
 
+PAGE = Path(__file__).parents[1] / "docs" / "paper.md"
 needs_renderer = pytest.mark.skipif(not find_spec("pyvista"), reason="pyvista is not installed")
 
 
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory):
     folder = tmp_path_factory.mktemp("paper")
-    assert main(["paper", "--quick", "--out", str(folder)]) == 0
-    return folder
+    (folder / "images").mkdir()
+    page = shutil.copy(PAGE, folder)
+    assert main(["paper", "--quick", "--out", str(folder / "out"), "--page", page]) == 0
+    return folder / "out"
 
 
 def tables(text):
@@ -65,12 +70,28 @@ def test_headline_holds_the_paper_s_ratios(quick):
             assert [row[1].strip() for row in rows] == ["0.14", "0.93", "", "0.81"]
 
 
-def test_quick_draws_every_picture(quick):
+def test_quick_draws_every_picture_as_wide_as_a_page(quick):
     names = {"alpha", "real-decision", "real-matches", "synthetic-decision", "synthetic-matches"}
     for name in names:
         image = cv2.imread(str(quick / f"paper-{name}.png"))
         assert image is not None
         assert image.std() > 5
+        assert image.shape[1] == 1000
+        copy = quick.parent / "images" / f"paper-{name}.png"
+        assert copy.read_bytes() == (quick / f"paper-{name}.png").read_bytes()
+
+
+def test_the_page_holds_the_tables_of_the_report_and_its_own_words(quick):
+    def words(text):
+        return [line for line in text.splitlines() if not line.startswith("|")]
+
+    page = (quick.parent / PAGE.name).read_text("utf-8")
+    # Only the summary at the top, and what it says, are written by hand.
+    assert words(page) == words(PAGE.read_text("utf-8"))
+    report = set((quick / "paper.md").read_text("utf-8").splitlines())
+    own = [line for line in page.splitlines() if line.startswith("|") and line not in report]
+    assert own[0] == "| the paper says | we find |"
+    assert all(line.count("|") == 3 for line in own)
 
 
 def test_draws_are_as_large_as_the_paper_s_and_differ(quick):

@@ -307,6 +307,23 @@ class TestReport:
         assert "| b | 9 | lost | 6.00 | cv2:USAC_ACCURATE |" in text
         assert "| ours:USAC_ACCURATE | 0.400 | 1.000 | 0.600 |" in text
 
+    def test_words_stand_left_and_figures_right(self):
+        body = [["a", "1.5 [1 to 2]", "motorcycle", ""], ["b", "lost [2 to lost]", "7-point", "3"]]
+        table = report._table(["method", "error", "pair", "n"], body)
+        assert table.splitlines()[1] == "| --- | --: | --- | --: |"
+
+    def test_a_page_is_filled_with_the_tables_it_names(self, tmp_path):
+        page = tmp_path / "page.md"
+        old = "# Page\n\n| own |\n| --- |\n\n<!-- table: B, all -->\n\n| x |\n| 1 |\n\nWords.\n"
+        page.write_text(old)
+        report.fill(page, "## A\n\n| a |\n\n## B, all\n\nAbout \\1.\n\n| b |\n| --: |\n| 2 |\n")
+        assert page.read_text() == old.replace("| x |\n| 1 |", "| b |\n| --: |\n| 2 |")
+        with pytest.raises(ValueError, match=r"no table 'B, all' in the report; it has \['A'\]"):
+            report.fill(page, "## A\n\n| a |\n")
+        page.write_text("<!-- table: A -->\n\nGone.\n")
+        with pytest.raises(ValueError, match="no table below"):
+            report.fill(page, "## A\n\n| a |\n")
+
     def test_command_line_from_scenes_to_files(self, tmp_path, capsys):
         out, plots = tmp_path / "out.json", tmp_path / "plots"
         arguments = "synthetic --scenes clusters rotation --n 60 --inlier-ratio .6 --noise .5"
