@@ -23,7 +23,7 @@ import cv_densityf
 from cv_densityf._density import density_peaks
 from cv_densityf._engine import GRAPH_CUT_MAX, METHODS, Robust, method_flag
 from cv_densityf._epipolar import Floats, residuals
-from cv_densityf._estimate import Estimate, estimate_fundamental, finite_in_cv2
+from cv_densityf._estimate import DENSITIES, Estimate, estimate_fundamental, finite_in_cv2
 from cv_densityf._files import InputError, read_matches, replacing
 from cv_densityf._run_script import add_run, run_script
 from cv_densityf.matching import (
@@ -180,7 +180,7 @@ def _add_match(commands: argparse._SubParsersAction[Any]) -> None:
     )
     estimate.add_argument(
         "--density",
-        choices=("contrast", "paper", "off"),
+        choices=DENSITIES,
         default="contrast",
         help="how the dense matches are chosen (%(default)s)",
     )

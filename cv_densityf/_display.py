@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cv_densityf.plotting import _axes
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
@@ -91,13 +93,7 @@ class DecisionGraphDisplay:
         ImportError
             If matplotlib is not installed.
         """
-        if ax is None:
-            from cv_densityf.plotting import require_matplotlib
-
-            require_matplotlib()
-            from matplotlib import pyplot
-
-            _, ax = pyplot.subplots()
+        ax = _axes(ax, (6.4, 4.8))
         rho, delta = np.asarray(self.rho, dtype=float), np.asarray(self.delta, dtype=float)
         is_center = np.zeros(len(rho), dtype=bool)
         is_center[np.asarray([] if self.centers is None else self.centers, dtype=int)] = True

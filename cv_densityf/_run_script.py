@@ -16,6 +16,7 @@ from runpy import _run_module_as_main  # type: ignore[attr-defined]
 from types import ModuleType
 from typing import Any
 
+from cv_densityf._estimate import DENSITIES
 from cv_densityf.patching import call_sites, patch_cv2
 
 CANNOT_OPEN = 2
@@ -35,7 +36,7 @@ def add_run(commands: argparse._SubParsersAction[Any]) -> None:
     )
     parser.add_argument(
         "--density",
-        choices=("contrast", "paper", "off"),
+        choices=DENSITIES,
         default="contrast",
         help="how the dense matches are chosen (%(default)s)",
     )

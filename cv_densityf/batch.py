@@ -35,10 +35,11 @@ def estimate_many(
         What `estimate_fundamental` takes, pixels. Read as results are wanted, a little ahead, so a
         generator that loads pairs keeps memory small.
     n_jobs : int, optional
-        Pairs at a time; -1 for one per core. By default what `joblib.parallel_config` says, else 1.
+        Pairs at a time; -1 for one per core. By default what ``joblib.parallel_config`` says, else
+        1.
     backend : str, optional
         joblib's: ``"loky"`` (processes), ``"threading"``, ``"dask"``, ``"ray"`` ... By default what
-        `joblib.parallel_config` says, else processes.
+        ``joblib.parallel_config`` says, else processes.
     progress : bool, optional
         Show a bar on standard error. By default if that is a terminal and tqdm is installed.
     **options

@@ -25,7 +25,7 @@ extensions = [
 exclude_patterns = ["_build", "examples", "gallery/*.ipynb", "gallery/*.py"]
 nitpicky = True
 default_role = "py:obj"  # the single backticks of the docstrings
-nitpick_ignore_regex = [("py:obj", r"(joblib|numpy|sklearn)\..*")]  # other people's pages
+nitpick_ignore_regex = [("py:obj", r"(numpy|sklearn)\..*")]  # other people's pages
 templates_path = ["_templates"]
 smartquotes = False  # x' is no quotation
 
