@@ -24,8 +24,11 @@ from benchmarks.run import one_thread, warm_up
 from benchmarks.scenes import make_scene
 from cv_densityf import _estimate
 from cv_densityf._density import density_peaks
+from cv_densityf._estimate import estimate_fundamental
 from cv_densityf._prefilter import contrast_support
 from cv_densityf.batch import estimate_many
+from cv_densityf.datasets import motorcycle
+from cv_densityf.matching import match_images
 
 Floats = NDArray[np.float64]
 
@@ -48,6 +51,8 @@ MAX_OTHERS = 20_000
 INLIER_RATIO, NOISE = 0.3, 0.5
 #: Pairs estimated by one worker and by two, by the clock, the faster of some runs.
 N_PAIRS, PAIR_SIZE, RUNS = 200, 1_000, 5
+#: Scenes over which the time of one pair is the median.
+N_COSTED = 10
 #: Inlier ratios at which a search on a part is held against one on all matches.
 RATIOS = (0.1, 0.2, 0.3, 0.5)
 #: Pixels between the matches of a real pair's optical flow, and the share of them made wrong.
@@ -141,6 +146,8 @@ def scale(
             parts.append(f"{title}\n\n{_errors(clustering, cluster_numbers)}")
     with one_thread():
         parts.append("## Pairs per second / one worker's\n\n" + _speedups(measure_workers(kind)))
+        unit = f"estimating a pair of {PAIR_SIZE:,} matches"
+        parts.append(f"## Time / {unit}\n\n" + _costs(measure_costs(kind)))
     if plot:
         draw(plot, calls, clustering)
     return "\n\n".join(parts) + "\n"
@@ -311,6 +318,37 @@ def measure_workers(kind: str) -> dict[str, float]:
     return {name: best["one"] / seconds for name, seconds in best.items() if name != "one"}
 
 
+def measure_costs(kind: str) -> dict[str, float]:
+    """Give processor times as multiples of that of estimating a pair of `PAIR_SIZE` matches."""
+
+    def estimate(pair: Pair) -> object:
+        return estimate_fundamental(pair.X[:, :2], pair.X[:, 2:])
+
+    numbers = (PAIR_SIZE // 2, PAIR_SIZE, 10 * PAIR_SIZE)
+    pairs = Series()
+    for n in numbers:
+        for pair in _scenes(kind, n, N_COSTED):
+            _add(pairs, pair, estimate, has_error=False)
+    unit = pairs.time(PAIR_SIZE)
+    costs = {f"estimating a pair of {n:,}": pairs.time(n) / unit for n in numbers}
+    points = [(pair.X[:, :2], pair.X[:, 2:]) for pair in _scenes(kind, PAIR_SIZE, N_COSTED)]
+    handed = points * (N_PAIRS // N_COSTED)
+    # The first run, not counted, starts the processes.
+    for _ in range(2):
+        start = time.process_time()
+        list(estimate_many(handed, progress=False, n_jobs=2, backend="loky"))
+        ms = 1e3 * (time.process_time() - start)
+    costs[f"handing a pair of {PAIR_SIZE:,} to another process"] = ms / len(handed) / unit
+    photographs = motorcycle()
+    # The first call touches cold memory.
+    for _ in range(2):
+        start = time.process_time()
+        n = len(match_images(photographs.image1, photographs.image2).X)
+        ms = 1e3 * (time.process_time() - start)
+    costs[f"finding {n:,} matches of two photographs by SIFT"] = ms / unit
+    return costs
+
+
 def _scenes(kind: str, n: int, scenes: int) -> Iterable[Pair]:
     for seed in range(scenes if n <= FIT[1] else 1):
         yield make_scene(kind, n, INLIER_RATIO, NOISE, seed)
@@ -388,15 +426,17 @@ def _times(
             if name == MATRIX and s.ms and np.isnan(ms):
                 last = max(s.ms)
                 ms, form = s.time(last) * (n / last) ** 2, "({})"
-            cell = _cell(ms, ".1f") if reference is None else _ratio(ms, series[reference].time(n))
+            if reference is None:
+                cell = _cell(ms, ".1f")
+            else:
+                cell = _two_digits(ms / series[reference].time(n))
             row.append(form.format(cell) if cell else "")
         body.append([*row, _cell(s.exponent, ".2f")])
     return _table(header, body)
 
 
-def _ratio(ms: float, reference: float) -> str:
-    """Two digits and no more, for times differ that much from run to run."""
-    ratio = ms / reference
+def _two_digits(ratio: float) -> str:
+    """No more, for times differ that much from run to run."""
     return _cell(ratio, ".0f" if ratio >= 10 else ".1f" if ratio >= 1 else ".2f")
 
 
@@ -424,6 +464,10 @@ def _speedups(found: Mapping[str, float]) -> str:
     return _table(header, [[name, f"{ratio:.2f}"] for name, ratio in found.items()])
 
 
+def _costs(costs: Mapping[str, float]) -> str:
+    return _table(["", "processor time"], [[name, _two_digits(x)] for name, x in costs.items()])
+
+
 def _memory(memory: Mapping[int, Mapping[str, float]]) -> str:
     names = list(dict.fromkeys(name for peaks in memory.values() for name in peaks))
     body = (
@@ -437,7 +481,7 @@ def draw(path: str, calls: Mapping[str, Series], clustering: Mapping[str, Series
     """Draw time over the number of matches, both logarithmic."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    figure = Figure(figsize=(10, 5), layout="constrained")
     panels = [
         (title, series)
         for title, series in (("estimating F", calls), ("clustering", clustering))
@@ -465,5 +509,5 @@ def draw(path: str, calls: Mapping[str, Series], clustering: Mapping[str, Series
         ax.set_ylabel("time, ms")
         ax.grid(color="0.9", which="both")
         ax.set_axisbelow(True)
-        ax.legend(fontsize=7.5, frameon=False)
-    figure.savefig(path, dpi=130)
+        ax.legend(fontsize=8.5, frameon=False)
+    figure.savefig(path, dpi=100)

@@ -38,6 +38,7 @@ def test_tables_hold_every_method_and_size(capsys, tmp_path, monkeypatch):
     # Starts a process per method, which takes its time.
     monkeypatch.setattr(scale, "measure_memory", lambda n, kind: {"density_peaks": 12.0})
     monkeypatch.setattr(scale, "measure_workers", lambda kind: {"two processes": 1.75})
+    monkeypatch.setattr(scale, "measure_costs", lambda kind: {"a pair": 0.123})
     monkeypatch.setattr(scale, "STRIDES", (20,))
     plot = tmp_path / "scale.png"
     numbers = ["--n", "1000", "--cluster-n", "300", "600", "--scenes", "1"]
@@ -53,6 +54,12 @@ def test_tables_hold_every_method_and_size(capsys, tmp_path, monkeypatch):
     assert len(rival) == 5
     assert "| density_peaks |" in text.split("## Clustering")[1]
     assert "| two processes | 1.75 |" in text
+    assert "| a pair | 0.12 |" in text
+    title = f"## Clustering, time / {scale.EXACT}"
+    (matrix,) = [
+        line for line in text.split(title)[1].splitlines() if line.startswith(f"| {scale.MATRIX} |")
+    ]
+    assert all(float(cell) > 0 for cell in matrix.split("|")[2:4])
     assert plot.stat().st_size > 10_000
 
 
@@ -94,6 +101,35 @@ def test_workers_are_timed_by_the_clock(monkeypatch):
     found = scale.measure_workers("clusters")
     assert set(runs) == {scale.N_PAIRS}
     assert found == pytest.approx({"two processes": 2, "two threads": 2})
+
+
+def test_costs_are_multiples_of_a_pairs(monkeypatch):
+    clock = [0.0]
+
+    def takes(seconds, result=None):
+        clock[0] += seconds
+        return result
+
+    photographs = SimpleNamespace(X=np.zeros((7, 4)))
+    monkeypatch.setattr(scale, "time", SimpleNamespace(process_time=lambda: clock[0]))
+    monkeypatch.setattr(scale, "estimate_fundamental", lambda one, two: takes(2 * len(one)))
+    monkeypatch.setattr(scale, "estimate_many", lambda pairs, **_: takes(50 * len(pairs), []))
+    monkeypatch.setattr(scale, "match_images", lambda *images: takes(9000, photographs))
+    assert list(scale.measure_costs("clusters").values()) == [0.5, 1, 10, 0.025, 4.5]
+
+
+def test_times_that_were_not_run_are_extrapolated_in_brackets_or_left_out():
+    series = {
+        scale.EXACT: scale.Series({1_000: [10.0], 4_000: [100.0], 20_000: [500.0]}),
+        scale.MATRIX: scale.Series({1_000: [30.0], 4_000: [400.0]}),
+    }
+    table = scale._times(series, [1_000, 4_000, 20_000, 40_000], scale.EXACT)
+    exact, matrix = ([c.strip() for c in row.split("|")[2:6]] for row in table.splitlines()[2:])
+    assert exact == ["1.0", "1.0", "1.0", ""]
+    assert matrix == ["3.0", "4.0", "(20)", ""]
+    assert "| 30.0 | 400.0 | (10000.0) | (40000.0) |" in scale._times(
+        series, [1_000, 4_000, 20_000, 40_000]
+    )
 
 
 def test_sampled_densities_are_measured_beside_exact_ones(monkeypatch):
