@@ -33,8 +33,11 @@ MAX_REFINED = 100_000
 #: A part is spread over cells of the first image, and in each of them over cells of the second:
 #: this many to the longer side.
 _CELLS = (16, 8)
-#: For LMEDS, which has no threshold: this part of the points' spread, some 3 px in a photograph.
-_LMEDS_THRESHOLD = 0.01
+#: The noise is the data's, and the caller's threshold rules the mask: the search has this part of
+#: the points' spread for its threshold, 1 to 3 px in a photograph, as far as it is within this
+#: factor of the caller's.
+_SEARCH_THRESHOLD = 0.01
+_LEEWAY = 2.0
 #: An F that explains fewer matches than a minimal sample is none.
 _MINIMAL = 7
 #: cv2's direct kernels take every match as true.
@@ -161,11 +164,8 @@ def _estimate(
     kept = np.zeros(n, dtype=bool)
     kept[rows] = support
     watch.lap("density")
-    threshold = robust.threshold
-    if robust.rule == "lmeds":  # makes a threshold of its own, whatever the unit of the points
-        threshold = _LMEDS_THRESHOLD * middle(Z)[1]
     asked: dict[str, Any] = {
-        "threshold": threshold,
+        "threshold": _search_threshold(Z, robust, density),
         "confidence": robust.confidence,
         "max_iters": robust.max_iters,
         "seed": seed,
@@ -207,6 +207,15 @@ def _estimate(
         timings=watch.laps,
         votes=found.votes,
     )
+
+
+def _search_threshold(X: NDArray[np.float64], robust: Robust, density: str) -> float:
+    own = _SEARCH_THRESHOLD * middle(X)[1]
+    if robust.rule == "lmeds":  # takes none from the caller
+        return own
+    if density == "paper":  # th of its step 5
+        return robust.threshold
+    return min(max(own, robust.threshold / _LEEWAY), robust.threshold * _LEEWAY)
 
 
 def _spread(X: NDArray[np.float64], size: int, rng: np.random.Generator) -> NDArray[np.intp]:

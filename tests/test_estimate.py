@@ -649,8 +649,8 @@ def test_matches_beyond_the_search_refine_the_result(monkeypatch):
 
 
 def test_all_matches_vote_on_what_a_part_has_found(monkeypatch):
-    """Nine of ten right matches are on one wall, and 80 of the part's 600 are right."""
-    monkeypatch.setattr("cv_densityf._estimate.MAX_SEARCHED", 600)
+    """Nine of ten right matches are on one wall, and 60 of the part's 400 are right."""
+    monkeypatch.setattr("cv_densityf._estimate.MAX_SEARCHED", 400)
     errors = {1: [], 3: []}
     for finalists, found in errors.items():
         monkeypatch.setattr("cv_densityf._consensus._FINALISTS", finalists)
@@ -659,6 +659,29 @@ def test_all_matches_vote_on_what_a_part_has_found(monkeypatch):
             found.append(pair.error(estimate(pair.X).F))
     chosen, voted = np.array(errors[1]), np.array(errors[3])
     assert (voted < 0.95 * chosen).sum() > 4 + (voted > 1.05 * chosen).sum()
+
+
+def test_the_threshold_rules_the_mask_and_not_the_search():
+    """Within a factor of two of what the spread of the points says, which is 2 to 3 px here."""
+    scene = two_view_scene(400, inlier_ratio=0.5, noise=1.0, random_state=0)
+    X = np.hstack([scene.points1, scene.points2])
+    narrow, wide = (run(X, Robust(cv2.USAC_DEFAULT, t, 0.999, 5000)) for t in (1.6, 4.0))
+    np.testing.assert_array_equal(narrow.F, wide.F)
+    assert narrow.n_inliers < wide.n_inliers
+    np.testing.assert_array_equal(wide.mask, inlier_mask(wide.F, X, "usac", 4.0))
+
+
+@pytest.mark.parametrize("noise", [0.02, 20.0])
+def test_the_search_is_within_a_factor_of_the_threshold(noise):
+    """Where the noise is far from an ordinary photograph's, the caller may say so."""
+    fit = []
+    for seed in range(5):
+        scene = two_view_scene(400, inlier_ratio=0.6, noise=noise, random_state=seed)
+        exact = two_view_scene(400, inlier_ratio=0.6, noise=0.0, random_state=seed)
+        X = np.hstack([exact.points1, exact.points2])[exact.inliers]
+        told = estimate_fundamental(scene.points1, scene.points2, threshold=3 * noise)
+        fit.append(np.median(sampson_distance(told.F, X)))
+    assert np.median(fit) < 0.25 * noise
 
 
 def test_an_f_that_fits_next_to_nothing_is_not_ours():
