@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import doctest
 import re
 from pathlib import Path
@@ -58,3 +59,20 @@ def test_links_lead_somewhere(page):
         assert target.is_file(), f"{link}: no such file"
         if anchor:
             assert anchor in slugs(target.read_text("utf-8")), f"{link}: no such heading"
+
+
+def test_files_import_only_from_those_above_them():
+    """As the table of the page for contributors says, which names every file."""
+    package = ROOT / "cv_densityf"
+    page = (ROOT / "docs" / "contributing.md").read_text("utf-8")
+    listed = re.findall(r"^\| `(\w+)\.py` \|", page, re.MULTILINE)
+    assert {*listed, "__init__"} == {path.stem for path in package.glob("*.py")}
+    for place, name in enumerate(listed):
+        tree = ast.parse((package / f"{name}.py").read_text("utf-8"))
+        imported = {
+            module
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("cv_densityf")
+            for module in (node.module.split(".")[1:] or [each.name for each in node.names])
+        }
+        assert imported <= set(listed[:place]), name
