@@ -119,7 +119,7 @@ def _table(header: Sequence[str], body: Iterable[Sequence[str]]) -> str:
 
 
 def _is_words(cell: str) -> bool:
-    return cell[:1].isalpha() and not cell.startswith(_LOST)
+    return cell[:1].isalpha() and cell != "inf" and not cell.startswith(_LOST)
 
 
 def fill(page: str | Path, report: str) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -13,6 +15,12 @@ from benchmarks import scale, sfm
 from benchmarks.__main__ import main
 from benchmarks.rendered import View
 from cv_densityf import density_peaks
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def tables(page):
+    return [line for line in Path(page).read_text("utf-8").splitlines() if line.startswith("|")]
 
 
 def test_exponents_of_known_powers():
@@ -40,10 +48,14 @@ def test_tables_hold_every_method_and_size(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr(scale, "measure_workers", lambda kind: {"two processes": 1.75})
     monkeypatch.setattr(scale, "measure_costs", lambda kind: {"a pair": 0.123})
     monkeypatch.setattr(scale, "STRIDES", (20,))
-    plot = tmp_path / "scale.png"
+    monkeypatch.setattr(scale, "RATIOS", (0.3,))
+    monkeypatch.setattr(scale._estimate, "MAX_SEARCHED", 400)
+    plot, page = tmp_path / "scale.png", shutil.copy(DOCS / "scale.md", tmp_path)
     numbers = ["--n", "1000", "--cluster-n", "300", "600", "--scenes", "1"]
-    assert main(["scale", *numbers, "--plot", str(plot)]) == 0
+    assert main(["scale", *numbers, "--plot", str(plot), "--page", page]) == 0
     text = capsys.readouterr().out
+    assert set(tables(page)) - set(text.splitlines()) <= set(tables(DOCS / "scale.md"))
+    assert "| a pair | 0.12 |" in tables(page)
     times = text.split("## Time, ms")[1].split("##")[0]
     for name in (*scale.CALLS, scale.FILTER):
         (row,) = [line for line in times.splitlines() if line.startswith(f"| {name} |")]
@@ -155,6 +167,21 @@ def test_peak_memory_sees_what_is_allocated_and_freed(tmp_path, monkeypatch):
 def test_nothing_to_measure_is_refused(capsys):
     assert main(["scale", "--n", "1"]) == 2
     assert "start at 2" in capsys.readouterr().err
+
+
+def test_the_page_holds_what_the_mapper_made(tmp_path, monkeypatch, capsys):
+    models = {
+        "pycolmap": sfm.Model(66, 900, 12, 70, 0.5, 0.25, 4.0),
+        "cv-densityf": sfm.Model(65, 800, 11, 60, np.inf, 0.125, 1.0),
+    }
+    monkeypatch.setattr(sfm, "compare", lambda *arguments: models)
+    page = shutil.copy(DOCS / "sfm.md", tmp_path)
+    assert sfm.main(["--scenes", "columns", "--page", page]) == 0
+    row = "| columns | ratio 0.8 | cv-densityf | 65 | 800 | 11 | 60 | inf | 0.125 | 0.25 |"
+    assert row in tables(page)
+    assert row in capsys.readouterr().out
+    assert not any(line.startswith("| gallery") for line in tables(page))
+    assert any(line.startswith("| `--resume`") for line in tables(page))
 
 
 class _Pose:
