@@ -17,7 +17,7 @@ import pytest
 from cv_densityf import estimate_fundamental
 from cv_densityf.__main__ import main
 from cv_densityf._files import InputError
-from cv_densityf.colmap import DEGENERATE, UNCALIBRATED, verify_matches
+from cv_densityf.colmap import DEGENERATE, UNCALIBRATED, _open, verify_matches
 from cv_densityf.datasets import two_view_scene
 
 pycolmap = pytest.importorskip("pycolmap")
@@ -238,7 +238,10 @@ def test_refuses_a_locked_database(database, capsys, monkeypatch):
     monkeypatch.setattr("cv_densityf.colmap._PATIENCE", 0.1)
     holder = sqlite3.connect(database, isolation_level=None)
     holder.execute("BEGIN IMMEDIATE")
-    assert "another program has it locked" in refused(database, capsys)
+    with monkeypatch.context() as early:
+        # Not after an hour's work.
+        early.setattr("cv_densityf.colmap.estimate_many", pytest.fail)
+        assert "another program has it locked" in refused(database, capsys)
     holder.execute("ROLLBACK")
     holder.close()
     assert main(["verify", str(database), "--jobs", "1"]) == 0
@@ -251,6 +254,23 @@ def test_refuses_a_damaged_database(database, capsys, where):
         stream.seek(int(where * size) // 4096 * 4096)
         stream.write(b"\xa5" * 40960)
     refused(database, capsys)
+
+
+def test_refuses_a_database_with_damage_where_nobody_looks(database, capsys):
+    ((page,),) = sql(database, "SELECT rootpage FROM sqlite_master WHERE name = 'index_name'")
+    ((size,),) = sql(database, "PRAGMA page_size")
+    with open(database, "r+b") as stream:
+        stream.seek((page - 1) * size)
+        stream.write(b"\xa5" * size)
+    assert "restore it from a copy" in refused(database, capsys)
+
+
+def test_a_dry_run_could_not_write_if_it_would(database):
+    with (
+        pytest.raises(InputError, match="cannot be written"),
+        _open(database, write=False) as connection,
+    ):
+        connection.execute("DELETE FROM matches")
 
 
 @pytest.mark.parametrize(
@@ -315,6 +335,8 @@ def test_killed_at_any_point_the_database_is_intact_and_resume_goes_on(tmp_path)
 def test_a_pair_that_fails_is_named_and_left_to_resume(database, monkeypatch):
     import cv_densityf.batch as batch
 
+    # What an earlier run has found for that pair does not stay.
+    verify_matches(database)
     genuine = batch.estimate_fundamental
     calls = []
 

@@ -120,7 +120,7 @@ def test_a_pure_shift_of_one_epipole_is_an_integral_over_the_images():
     assert epipolar_distance(F0, half_way, SIZE1, SIZE1) == pytest.approx(distance / 2, rel=0.05)
 
 
-@given(seed=st.integers(0, 2**32), scale=st.sampled_from([-1.0, 1e-200, -3e150]))
+@given(seed=st.integers(0, 2**32), scale=st.sampled_from([-1.0, 1e-200, -3e150, 1e303]))
 @settings(max_examples=30)
 def test_neither_scale_nor_order_nor_direction_matters(seed, scale):
     F0, F1 = general(seed), general(seed + 1)
@@ -191,6 +191,11 @@ def test_other_ranks_have_lines_too(rank):
     assert np.linalg.matrix_rank(F / np.linalg.norm(F), tol=1e-12) == rank
     distance = epipolar_distance(F, general(0), SIZE1, SIZE2)
     assert 0 < distance < np.inf
+
+
+def test_a_line_along_the_border_is_in_the_image():
+    top = np.outer([0.0, 1.0, 0.0], [1.0, 3.0, -900.0])
+    assert 0 < epipolar_distance(top, general(0), SIZE1, SIZE2) < np.inf
 
 
 def test_the_seed_decides_the_points():
