@@ -123,8 +123,9 @@ def two_view_scene(
     >>> scene = two_view_scene(200, inlier_ratio=0.3, noise=0)
     >>> scene.X.shape, int(scene.inliers.sum())
     ((200, 4), 60)
-    >>> from cv_densityf._epipolar import sampson_distance
-    >>> bool(sampson_distance(scene.F, scene.X[scene.inliers]).max() < 1e-6)
+    >>> from cv_densityf import estimate_fundamental
+    >>> estimate = estimate_fundamental(scene.points1, scene.points2)
+    >>> bool(estimate.mask[scene.inliers].all())
     True
     """
     if n < 0:
