@@ -18,6 +18,7 @@ from cv_densityf._epipolar import (
     eight_point,
     essential_ratio,
     inlier_mask,
+    middle,
     point_line_squared,
     polish,
     residuals,
@@ -146,6 +147,7 @@ def test_a_distance_from_no_line_is_said_without_a_warning():
         assert np.isinf(residuals(infinitely_far, X, rule)).all()
         assert not inlier_mask(np.zeros((3, 3)), X, rule, 1e9).any()
         assert not inlier_mask(infinitely_far, X, rule, 1e9).any()
+    assert (Frame(X).sampson(infinitely_far[None]) > 1e200).all()
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -195,6 +197,71 @@ def test_frame_of_one_spot_is_finite():
     frame = Frame(np.full((20, 4), 7.0))
     assert np.isfinite(frame.scale)
     assert np.isfinite(frame.leave(frame.enter(np.eye(3)[None]))).all()
+
+
+def test_middle_is_the_mean_and_the_deviation_about_it():
+    X = np.random.default_rng(0).normal([5.0, -40, 300, 2e4], [1.0, 20, 3, 9], (150, 4))
+    centre, spread = middle(X)
+    np.testing.assert_allclose(centre, X.mean(axis=0), rtol=1e-12)
+    assert spread == pytest.approx(np.sqrt(X.var(axis=0).mean()), rel=1e-12)
+
+
+@pytest.mark.parametrize("column", range(4))
+def test_nearly_a_quarter_far_out_in_one_coordinate_does_not_move_the_middle(column):
+    X = np.random.default_rng(column).uniform(0, 0.1, (160, 4))
+    away = X[:50].copy()
+    away[:, column] += 1e9
+    expected = middle(X)
+    for both in (np.vstack([X, away]), np.vstack([away, X])):
+        centre, spread = middle(both)
+        np.testing.assert_allclose(centre, expected[0], rtol=1e-12)
+        assert spread == pytest.approx(expected[1], rel=1e-12)
+
+
+@pytest.mark.parametrize(("copies", "jitter"), [(50, 1e-3), (74, 1e-3), (80, 0.0)])
+def test_copies_of_one_match_do_not_turn_the_others_out(copies, jitter):
+    """Up to three quarters of nearly the same, or any number of exactly the same."""
+    rng = np.random.default_rng(copies)
+    X = rng.uniform(0, 900, (100, 4))
+    X[:copies] = 450 + jitter * rng.normal(size=(copies, 4))
+    centre, spread = middle(X)
+    np.testing.assert_allclose(centre, X.mean(axis=0), rtol=1e-12)
+    assert spread == pytest.approx(np.sqrt(X.var(axis=0).mean()), rel=1e-12)
+
+
+@pytest.mark.parametrize(("reach", "counts"), [(4.9, True), (5.0, True), (5.1, False)])
+def test_far_out_is_more_than_five_times_as_far_as_three_quarters(reach, counts):
+    X = np.repeat([[-1.0] * 4, [1.0] * 4, [0.0] * 4], 5, axis=0)
+    far = np.diag([reach, 0, 0, 0])[:1]
+    anywhere = np.array([1000.0, -2000.0, 0.0, 64.0])
+    spread = middle(np.vstack([X, far, -far]) + anywhere)[1]
+    assert spread == pytest.approx(np.sqrt((40 + 2 * counts * reach**2) / (60 + 8 * counts)))
+
+
+def test_a_part_of_a_frame_is_the_frame_of_fewer_matches():
+    scene = noisy_scene(0)
+    rng = np.random.default_rng(0)
+    # Others about the same middle, or the frame of the part alone would be another.
+    centre, spread = middle(scene.X)
+    others = rng.normal(size=(100, 4))
+    others -= others.mean(axis=0)
+    others = centre + others * spread / np.sqrt((others**2).mean())
+    rows = np.isin(np.arange(300), rng.choice(300, 200, replace=False))
+    X = np.empty((300, 4))
+    X[rows], X[~rows] = scene.X, others
+    whole, alone = Frame(X), Frame(scene.X)
+    part = whole.part(rows)
+    F = scene.F[None]
+    start = perturbed(alone, scene.F, 0, 1e-3)
+    for frame in (part, whole):
+        np.testing.assert_allclose(frame.enter(F), alone.enter(F), atol=1e-12)
+        np.testing.assert_allclose(frame.leave(start), alone.leave(start), rtol=1e-9)
+    np.testing.assert_allclose(part.sampson(start), alone.sampson(start), rtol=1e-6)
+    polished, expected = polish(part, start, [3.0] * 3), polish(alone, start, [3.0] * 3)
+    np.testing.assert_allclose(unit(polished[0]), unit(expected[0]), atol=1e-9)
+    assert whole.sampson(start).shape == (1, 300)
+    otherwise = polish(whole, start, [3.0] * 3)
+    assert np.abs(unit(otherwise[0]) - unit(polished[0])).max() > 1e-5
 
 
 @pytest.mark.parametrize("k", [8, 9, 30])
@@ -398,9 +465,10 @@ def random_rank_two(rng, count):
 
 
 def test_essential_ratio_is_the_best_ratio_of_singular_values_over_focal_lengths():
-    F = random_rank_two(np.random.default_rng(0), 20)
+    zoom = np.diag([1 / 640, 1 / 640, 1])
+    F = zoom @ random_rank_two(np.random.default_rng(0), 50) @ zoom
     focal = 640 * np.geomspace(0.5, 4, 8)
-    expected = np.zeros(20)
+    expected = np.zeros(50)
     for f1, f2 in itertools.product(focal, focal):
         K1, K2 = np.diag([f1, f1, 1]), np.diag([f2, f2, 1])
         S = np.linalg.svd(K2.T @ F @ K1, compute_uv=False)
@@ -408,20 +476,42 @@ def test_essential_ratio_is_the_best_ratio_of_singular_values_over_focal_lengths
     np.testing.assert_allclose(essential_ratio(F, 640.0), expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize(("f1", "f2"), [(0.8, 0.8), (1.2, 2.4), (0.6, 3.0)])
-def test_essential_ratio_believes_real_cameras_and_doubts_chance(f1, f2):
+def two_cameras(rng, f1, f2):
+    """F of cameras with these focal lengths, in pixels from the middle of the images."""
+    R = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
+    E = np.cross(rng.normal(size=3), R, axisb=0, axisc=0)
+    return np.diag([1 / f2, 1 / f2, 1]) @ E @ np.diag([1 / f1, 1 / f1, 1])
+
+
+@pytest.mark.parametrize("size", [1.0, 2000.0])
+def test_essential_ratio_is_one_for_two_cameras_and_doubts_chance(size):
     rng = np.random.default_rng(1)
-    size = 1000.0
-    K1, K2 = np.diag([f1 * size, f1 * size, 1]), np.diag([f2 * size, f2 * size, 1])
-    E = random_rank_two(rng, 50)
-    U, _, Vt = np.linalg.svd(E)
-    E = (U * [1.0, 1.0, 0.0]) @ Vt
-    real = essential_ratio(np.linalg.inv(K2).T @ E @ np.linalg.inv(K1), size)
-    zoom = np.diag([1 / size, 1 / size, 1])
-    chance = essential_ratio(zoom @ random_rank_two(rng, 500) @ zoom, size)
+    listed = size * np.geomspace(0.5, 4, 8)
+    F = np.stack([two_cameras(rng, *pair) for pair in itertools.product(listed, listed)])
+    np.testing.assert_allclose(essential_ratio(F, size), 1, atol=1e-6)
+    between = size * rng.uniform(0.5, 4, (300, 2))
+    F = np.stack([two_cameras(rng, *pair) for pair in between])
+    real = essential_ratio(F, size)
     assert real.min() > 0.8
     assert np.median(real) > 0.9
+    zoom = np.diag([1 / size, 1 / size, 1])
+    wrong = zoom @ random_rank_two(rng, 300) @ zoom
+    chance = essential_ratio(wrong, size)
     assert np.median(chance) < 0.85
-    np.testing.assert_allclose(  # the images' order does not matter
-        essential_ratio(E, size), essential_ratio(E.transpose(0, 2, 1), size), rtol=1e-9
-    )
+    # Neither the order of the images, nor the scale and the sign of F, nor the unit matters.
+    for same in (
+        essential_ratio(wrong.transpose(0, 2, 1), size),
+        essential_ratio(-1e-9 * wrong, size),
+        essential_ratio(np.diag([0.01, 0.01, 1]) @ wrong @ np.diag([0.01, 0.01, 1]), 100 * size),
+    ):
+        np.testing.assert_allclose(same, chance, rtol=1e-6)
+
+
+def test_essential_ratio_knows_the_size_of_the_image_in_a_frame():
+    """That of a square evenly covered with matches."""
+    rng = np.random.default_rng(2)
+    frame = Frame(rng.uniform(-400, 400, (20_000, 4)))
+    F = np.stack([two_cameras(rng, *pair) for pair in rng.uniform(100, 9000, (200, 2))])
+    in_frame = essential_ratio(frame.enter(F))
+    np.testing.assert_allclose(in_frame, essential_ratio(F, 800.0), atol=0.02)
+    assert in_frame.max() - in_frame.min() > 0.3
