@@ -124,6 +124,9 @@ def _parser() -> argparse.ArgumentParser:
         reliability.add_argument(
             name, type=int, default=default, metavar="N", help=f"{about} (default %(default)s)"
         )
+    reliability.add_argument(
+        "--page", metavar="FILE", help="bring the tables of this page up to date"
+    )
     reliability.set_defaults(run=_reliability)
     return parser
 
@@ -237,7 +240,10 @@ def _reliability(args: argparse.Namespace) -> int:
     # The cases of the compat suite are made when it is imported.
     from benchmarks.reliability import reliability
 
-    print(reliability(args.calls, args.seconds, args.repeats, args.scenes, args.seed))
+    text = reliability(args.calls, args.seconds, args.repeats, args.scenes, args.seed)
+    print(text)
+    if args.page:
+        report.fill(args.page, text)
     return 0
 
 

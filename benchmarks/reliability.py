@@ -211,7 +211,7 @@ def beside_cv2(n: int, seed: int = 0) -> str:
         ("calls", n),
         ("which cv2 answers", count["answer"]),
         ("which cv2 refuses", count["error"]),
-        ("same kind of answer, or same refusal", count["same"]),
+        ("same kind of answer, or the same refusal", count["same"]),
         *((reason, count[reason]) for reason in (_MORE, _LESS, _SOLVED, _ZEROED)),
         ("any other difference", count["other"]),
         ("masks that can be worked out from F", count["masks"]),
@@ -334,8 +334,8 @@ _SAME = _similar()
 MAPS: dict[str, tuple[Floats, Floats, float]] = {
     "as it is": (_SAME, _SAME, 1.0),
     **{
-        f"times {factor:g}": (_similar(factor), _similar(factor), min(factor, 9e5))
-        for factor in (1e-3, 1e3, 1e6)
+        f"times {text}": (_similar(float(text)), _similar(float(text)), min(float(text), 9e5))
+        for text in ("1e-3", "1e3", "1e6")
     },
     "second image a million pixels away": (_SAME, _similar(x=1e6, y=-1e6), 1.0),
     "both images a million pixels away": (_similar(x=-1e6), _similar(x=1e6, y=-1e6), 1.0),
@@ -347,8 +347,8 @@ ADDED: dict[str, Callable[[Floats, np.random.Generator], Floats]] = {
     "one wrong match 500 times": lambda X, rng: np.tile(rng.uniform(0, 900, (1, 4)), (500, 1)),
     "one wrong match 2,000 times": lambda X, rng: np.tile(rng.uniform(0, 900, (1, 4)), (2000, 1)),
     **{
-        f"25 matches up to {far:g} px away": lambda X, rng, far=far: rng.uniform(-far, far, (25, 4))
-        for far in (1e4, 1e5, 1e6, 1e9)
+        f"25 matches up to 1e{k} px away": lambda X, rng, k=k: rng.uniform(-(10**k), 10**k, (25, 4))
+        for k in (4, 5, 6, 9)
     },
 }
 ESTIMATORS: dict[str, Callable[[Floats, Floats, float], Any]] = {

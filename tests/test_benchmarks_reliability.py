@@ -54,7 +54,7 @@ def test_calls_beside_cv2_add_up():
     assert found["calls"] == 150
     assert found["which cv2 answers"] + found["which cv2 refuses"] == 150
     assert min(found["which cv2 answers"], found["which cv2 refuses"]) > 10
-    kinds = ["same kind of answer, or same refusal", "any other difference"]
+    kinds = ["same kind of answer, or the same refusal", "any other difference"]
     kinds += [reliability._MORE, reliability._LESS, reliability._SOLVED, reliability._ZEROED]
     assert sum(found[kind] for kind in kinds) == 150
     assert found["any other difference"] == 0
