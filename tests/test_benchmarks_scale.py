@@ -14,6 +14,7 @@ import pytest
 from benchmarks import scale, sfm
 from benchmarks.__main__ import main
 from benchmarks.rendered import View
+from benchmarks.scenes import make_scene
 from cv_densityf import density_peaks
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -162,6 +163,15 @@ def test_peak_memory_sees_what_is_allocated_and_freed(tmp_path, monkeypatch):
 
     monkeypatch.setattr(scale, "density_peaks", hungry)
     assert scale._peak("density_peaks", str(path)) == pytest.approx(95.4, abs=8)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_million_matches_are_answered_in_bounded_memory(tmp_path):
+    pair = make_scene("clusters", 1_000_000, scale.INLIER_RATIO, scale.NOISE)
+    path = tmp_path / "X.npy"
+    np.save(path, pair.X)
+    assert scale._peak("ours:USAC_MAGSAC", str(path)) < 300
+    assert pair.error(scale.METHODS["ours:USAC_MAGSAC"].estimate(pair, scale.Settings())) < 0.1
 
 
 def test_nothing_to_measure_is_refused(capsys):
