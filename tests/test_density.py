@@ -69,9 +69,22 @@ def test_numbers_of_any_type_and_the_default_percentage():
         np.testing.assert_array_equal(peaks.delta, expected.delta)
 
 
-def test_no_weight_at_a_distance_that_overflows():
-    peaks = density_peaks([[0.0], [1e150], [1e150]], dc=1e-100, kernel="gaussian")
-    assert peaks.rho.tolist() == [0, 1, 1]
+def test_no_weight_at_a_distance_too_large_for_the_kernel():
+    """Whatever the caller has numpy do about it."""
+    with np.errstate(all="raise"):
+        over = density_peaks([[0.0], [1e150], [1e150]], dc=1e-100, kernel="gaussian")
+        under = density_peaks([[0.0], [30.0], [30.0]], dc=1.0, kernel="gaussian")
+    assert over.rho.tolist() == under.rho.tolist() == [0, 1, 1]
+
+
+@given(X=points, kernel=st.sampled_from(KERNELS), power=st.sampled_from([-14, 9]))
+def test_another_unit_of_length_changes_no_digit(X, kernel, power):
+    peaks, others = (density_peaks(Y, kernel=kernel) for Y in (X, X * 2.0**power))
+    np.testing.assert_array_equal(others.rho, peaks.rho)
+    np.testing.assert_array_equal(others.predecessor, peaks.predecessor)
+    np.testing.assert_array_equal(others.delta, peaks.delta * 2.0**power)
+    if peaks.delta.any():  # in one place any cut-off is as good
+        assert others.dc == peaks.dc * 2.0**power
 
 
 @given(X=lattice, dc=st.integers(1, 18).map(lambda s: float(np.sqrt(s))))
