@@ -231,8 +231,10 @@ def _paper(args: argparse.Namespace) -> int:
         print(text)
         if args.page:
             report.fill(args.page, text)
+            images = Path(args.page).parent / "images"
+            images.mkdir(exist_ok=True)
             for picture in folder.glob("paper-*.png"):
-                shutil.copy(picture, Path(args.page).parent / "images")
+                shutil.copy(picture, images)
     return 0
 
 

@@ -22,7 +22,6 @@ needs_renderer = pytest.mark.skipif(not find_spec("pyvista"), reason="pyvista is
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory):
     folder = tmp_path_factory.mktemp("paper")
-    (folder / "images").mkdir()
     page = shutil.copy(PAGE, folder)
     assert main(["paper", "--quick", "--out", str(folder / "out"), "--page", page]) == 0
     return folder / "out"
