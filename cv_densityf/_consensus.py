@@ -51,7 +51,7 @@ _VOTE_WIDTHS = np.array([0.3, 0.5, 0.8, 1.3])
 _GRID = 16
 #: Width of the weights in the polish, in units of the working threshold.
 _POLISH_WIDTH = 0.7
-_POLISH_STEPS = 3
+_POLISH_STEPS = 2
 #: The winner's last steps take weights of this many robust standard deviations: nearly all of what
 #: least squares gets out of normal noise, and little of what heavier tails put in.
 _REFINE_SIGMAS = 3.0

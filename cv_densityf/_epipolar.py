@@ -156,7 +156,8 @@ class Frame:
 
 def middle(X: Floats) -> tuple[Floats, float]:
     """Centroid (4,) of the matches and standard deviation about it, but for matches far out."""
-    away = np.abs(X - np.median(X, axis=0)).max(axis=1)
+    half = len(X) // 2
+    away = np.abs(X - np.partition(X, half, axis=0)[half]).max(axis=1)
     # Three quarters and not half, since half may be copies of one match.
     most = 3 * len(X) // 4
     reach = _FAR * np.partition(away, most)[most]
