@@ -155,6 +155,16 @@ def test_a_sample_of_all_but_one_misses_one_neighbor():
     assert 0 < np.abs(gap).max() < 1.5
 
 
+@given(n=st.integers(0, 40), width=st.integers(1, 70))
+def test_parts_are_as_large_as_a_block_allows(n, width):
+    with mock.patch.object(_density, "_BLOCK", 60):
+        parts = list(_density._parts(np.arange(n), width))
+    assert [row for part in parts for row in part] == list(range(n))
+    sizes = [len(part) for part in parts]
+    assert all(size * width <= 60 or size == 1 for size in sizes)
+    assert all((size + 1) * width > 60 for size in sizes[:-1])
+
+
 def test_ties_beyond_the_first_neighbors():
     """On a lattice more points are equally far than a neighbour list holds."""
     X = np.stack(np.meshgrid(*[np.arange(6.0)] * 3), axis=-1).reshape(-1, 3)
