@@ -143,6 +143,23 @@ def _output(*suffixes: str) -> Callable[[str], Path]:
     return parse
 
 
+def _add_method(parser: argparse._ActionsContainer, threshold: float, remark: str = "") -> None:
+    parser.add_argument(
+        "--method",
+        choices=METHODS,
+        default="usac_accurate",
+        metavar="NAME",
+        help=f"cv2's method: {', '.join(METHODS)} (%(default)s)",
+    )
+    parser.add_argument(
+        "--threshold",
+        metavar="PX",
+        type=_THRESHOLD,
+        default=threshold,
+        help=f"for inliers, pixels (%(default)s{remark})",
+    )
+
+
 def _add_match(commands: argparse._SubParsersAction[Any]) -> None:
     match = commands.add_parser(
         "match",
@@ -158,20 +175,7 @@ def _add_match(commands: argparse._SubParsersAction[Any]) -> None:
         "columns x,y,x',y' and optionally score; instead of images",
     )
     estimate = match.add_argument_group("estimate")
-    estimate.add_argument(
-        "--method",
-        choices=METHODS,
-        default="usac_accurate",
-        metavar="NAME",
-        help=f"cv2's method: {', '.join(METHODS)} (%(default)s)",
-    )
-    estimate.add_argument(
-        "--threshold",
-        metavar="PX",
-        type=_THRESHOLD,
-        default=1.0,
-        help="for inliers, pixels (%(default)s)",
-    )
+    _add_method(estimate, 1.0)
     estimate.add_argument(
         "--confidence", metavar="P", type=_SHARE, default=0.999, help="(%(default)s)"
     )
@@ -240,20 +244,7 @@ def _add_verify(commands: argparse._SubParsersAction[Any]) -> None:
         "two-view geometries, in place of COLMAP's own geometric verification.",
     )
     verify.add_argument("database", metavar="DATABASE", help="with keypoints and matches")
-    verify.add_argument(
-        "--method",
-        choices=METHODS,
-        default="usac_accurate",
-        metavar="NAME",
-        help=f"cv2's method: {', '.join(METHODS)} (%(default)s)",
-    )
-    verify.add_argument(
-        "--threshold",
-        metavar="PX",
-        type=_THRESHOLD,
-        default=4.0,
-        help="for inliers, pixels (%(default)s, as COLMAP)",
-    )
+    _add_method(verify, 4.0, ", as COLMAP")
     verify.add_argument(
         "--min-inliers",
         metavar="N",
