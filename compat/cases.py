@@ -386,6 +386,13 @@ def inputs() -> Iterator[Case]:
             yield Case(f"inputs/{name}/{method_name}", call(*points, third))
         for name, points in unequal.items():
             yield Case(f"inputs/{name}/{method_name}", call(*points, third), refused=True)
+    for n, method in itertools.product((2, 3), (cv2.FM_8POINT, cv2.FM_LMEDS, cv2.FM_RANSAC)):
+        points = p1[:n].T.copy()  # as well n rows of two or three numbers
+        yield Case(f"inputs/(2, {n}) of {n} points/{method}", call(points, points, method))
+    nothing = np.full((N // 2, 2, 2), np.nan, np.float32)
+    for method in (cv2.USAC_FAST, cv2.USAC_MAGSAC):
+        # The mask of a failure has as many rows as the array, half of the points.
+        yield Case(f"inputs/(N/2, 2, 2) of NaN/{method}", call(nothing, nothing, method))
     empties = {"(0, 2)": (0, 2), "(0, 1, 2)": (0, 1, 2), "(0, 3)": (0, 3)}
     for (name, shape), (method_name, method) in itertools.product(empties.items(), PATHS.items()):
         points = np.zeros(shape, np.float32)
@@ -400,14 +407,17 @@ def _read_only(points):
 
 def method_numbers() -> Iterator[Case]:
     """Any integer is a method to cv2: what it does not know is LMEDS."""
-    for n in (N, 12):
+    for n in (N, 15, 14, 12, 7, 6):
         X = scene(n)[0]
         for method in (*range(-10, 70), 100, 1000, 2**31 - 1, -(2**31)):
+            if n in (14, 15) and method not in range(20):
+                continue  # RANSAC is LMEDS below 15 points
             yield Case(
                 f"methods/{method}, n={n}",
                 with_method(X, method, 2.0),
-                unstable=method == PARALLEL,
-                direct=method == 2,
+                refused=n < 7 and method in USAC,
+                unstable=method == PARALLEL or (n == 7 and method in USAC),
+                direct=method not in USAC and n >= 7 and (n == 7 or method == 2),
                 X=X,
                 rule=rule_of(method, n),
                 threshold=2.0,
@@ -526,6 +536,36 @@ def degenerate_points() -> Iterator[Case]:
             )
 
 
+def far_away() -> Iterator[Case]:
+    """Good matches at large coordinates, where float32 cannot hold USAC's residuals any more."""
+    for offset in (1e4, 1e5, 1e6):
+        X = scene(200, 0.8, 0.3)[0] + np.float32(offset)
+        for name, method in METHODS.items():
+            yield Case(
+                f"far away/{offset:g}/{name}",
+                with_method(X, method, 2.0),
+                unstable=True,
+                X=X,
+                rule=rule_of(method, len(X)),
+                threshold=2.0,
+            )
+
+
+def stacked_solutions() -> Iterator[Case]:
+    """Seven points with one, two and three matrices through them."""
+    rng = np.random.default_rng(0)
+    for number, size in enumerate((3,) * 20 + (4,) * 20 + (1000,) * 5):
+        X = rng.integers(0, size, (7, 4)).astype(np.float32)
+        for name, method in (("FM_7POINT", 1), ("FM_RANSAC", 8)):
+            yield Case(
+                f"solutions/{number} of {size} x {size} pixels/{name}",
+                with_method(X, method),
+                direct=True,
+                X=X,
+                rule="all",
+            )
+
+
 def not_numbers() -> Iterator[Case]:
     """Some coordinates that are NaN or infinite: those points are no inliers."""
     for value, share in itertools.product((np.nan, np.inf, -np.inf), (0.05, 0.3)):
@@ -539,6 +579,7 @@ def not_numbers() -> Iterator[Case]:
                 f"not numbers/{value} in {len(rows)} rows/{name}",
                 with_method(X, method),
                 unstable=method == PARALLEL,
+                direct=method == cv2.FM_8POINT,
                 X=X,
                 rule=None if rule == "lmeds" else rule,
                 threshold=1.5 if method is None else 3.0,
@@ -605,16 +646,26 @@ def masks() -> Iterator[Case]:
                 f"masks/{name}, {situation}/{method_name}",
                 lambda make=make, p1=p1, p2=p2, third=third: ((p1, p2, third), {"mask": make()}),
                 refused=refused,
+                X=X,
+                # Where UsacParams finds nothing, the caller's mask comes back as it was.
+                rule=None
+                if method is None and situation == "nothing found"
+                else rule_of(method, n),
+                threshold=1.5 if method is None else 3.0,
             )
         for name in ("(N, 1)", "(N,)", "int32"):
             make = _masks(n)[name]
             yield Case(
                 f"masks/{name} seventh, {situation}",
                 lambda p1=p1, p2=p2, make=make: ((p1, p2, *numbers, 1000, make()), {}),
+                X=X,
+                rule=rule_of(cv2.FM_RANSAC, n),
             )
             yield Case(
                 f"masks/{name} sixth, {situation}",
                 lambda p1=p1, p2=p2, make=make: ((p1, p2, *numbers, make()), {}),
+                X=X,
+                rule=rule_of(cv2.FM_RANSAC, n),
             )
     p1, p2 = (cv2.UMat(p) for p in halves(scene(N)[0]))
     for method_name, method in PATHS.items():
@@ -624,6 +675,8 @@ def masks() -> Iterator[Case]:
                 (p1, p2, method),
                 {"mask": cv2.UMat(np.full((N, 1), 9, np.uint8))},
             ),
+            X=scene(N)[0],
+            rule=rule_of(method, N),
         )
 
 
@@ -643,6 +696,15 @@ def sizes() -> Iterator[Case]:
                 rule=rule_of(method, n),
                 threshold=2.0,
             )
+        cut = params(threshold=2.0, loMethod=cv2.LOCAL_OPTIM_GC, neighborsSearch=cv2.NEIGH_GRID)
+        yield Case(
+            f"sizes/{n}/UsacParams, graph cut",
+            call(*halves(X), cut),
+            unstable=versions.GRAPH_CUT_DIES and n > 46_340,
+            X=X,
+            rule="usac",
+            threshold=2.0,
+        )
 
 
 GROUPS = (
@@ -653,6 +715,8 @@ GROUPS = (
     numbers,
     counts,
     degenerate_points,
+    far_away,
+    stacked_solutions,
     not_numbers,
     masks,
     sizes,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections import Counter
+from collections import defaultdict
 from pathlib import Path
 
 import cv2
@@ -39,6 +39,12 @@ class Run:
             for aspect, text in self.differences[id_].items()
             if is_known(self.known, id_, aspect) is None
         }
+
+    def hold(self, id_):
+        """Fail, in the words of the difference, if the outcome is not cv2's."""
+        found = self.unexpected(id_)
+        if found:
+            pytest.fail("; ".join(f"[{aspect}] {text}" for aspect, text in found.items()), False)
 
     def by_line(self):
         """Cases that each line of the known differences covers."""
@@ -80,12 +86,28 @@ def pytest_configure(config):
     config.addinivalue_line("markers", "whole_table: needs the outcome of every case")
 
 
+def grouped(pairs):
+    """Collect the ids of each text, the most frequent text first."""
+    groups = defaultdict(list)
+    for text, id_ in pairs:
+        groups[text].append(id_)
+    return sorted(groups.items(), key=lambda group: -len(group[1]))
+
+
+def some(ids, limit=3):
+    more = f", and {len(ids) - limit:,} more" if len(ids) > limit else ""
+    return ", ".join(ids[:limit]) + more
+
+
 def pytest_terminal_summary(terminalreporter, config):
     made = config.stash.get(_RUN, None)
     if made is None:
         return
+    stats = terminalreporter.stats
+    failed = stats.get("failed", []) + stats.get("error", [])
+    n_passed = len(stats.get("passed", []))
     total = len(made.differences)
-    unexpected = {id_: made.unexpected(id_) for id_ in made.differences if made.unexpected(id_)}
+    unexpected = {id_: found for id_ in made.differences if (found := made.unexpected(id_))}
     known = {line: ids for line, ids in made.by_line().items() if ids}
     n_known = len({id_ for ids in known.values() for id_ in ids} - set(unexpected))
     write = terminalreporter.write_line
@@ -93,21 +115,29 @@ def pytest_terminal_summary(terminalreporter, config):
     write(f"{implementation.NAME} against OpenCV {cv2.__version__}")
     write(f"Python {platform.python_version()}, numpy {np.__version__}, {platform.machine()}")
     write(
-        f"{total} calls: {total - len(unexpected) - n_known} as cv2, {n_known} known differences, "
-        f"{len(unexpected)} unexpected differences"
+        f"{total:,} calls: {total - len(unexpected) - n_known:,} answered as cv2 does, "
+        f"{n_known:,} known differences, {len(unexpected):,} unexpected differences"
     )
-    groups = Counter(id_.split("/")[0] for id_ in made.differences)
-    write("  " + ", ".join(f"{group} {count}" for group, count in groups.items()))
+    groups = grouped((id_.split("/")[0], id_) for id_ in made.differences)
+    write("  " + ", ".join(f"{group} {len(ids)}" for group, ids in groups))
+    write(f"{n_passed + len(failed):,} checks: {n_passed:,} hold, {len(failed):,} fail")
     for line, ids in known.items():
-        write(f"known, {len(ids)} calls, OpenCV issue {line.issue}: {line.reason}")
-        for id_ in ids[:100]:
+        issue = "" if line.issue == "-" else f" (OpenCV issue {line.issue})"
+        write(f"known difference, {len(ids)} calls: {line.reason}{issue}")
+        for id_ in ids:
             write(f"    {id_} [{line.aspect}]")
-    for id_, found in unexpected.items():
-        for aspect, text in found.items():
-            write(f"UNEXPECTED {id_} [{aspect}] {text}")
+    for text, ids in grouped(
+        (f"[{aspect}] {text}", id_)
+        for id_, found in unexpected.items()
+        for aspect, text in found.items()
+    ):
+        write(f"UNEXPECTED {text}")
+        write(f"    {len(ids):,} calls: {some(ids)}")
+    for test, names in grouped(report.nodeid.partition("[")[::2] for report in failed):
+        names = [name.removesuffix("]") for name in names if name]
+        write(f"FAILS {test}" + (f"\n    {len(names):,} times: {some(names)}" if names else ""))
     target = config.getoption("--compat-json")
     if target:
-        failed = len(terminalreporter.stats.get("failed", []))
         record = {
             "implementation": implementation.NAME,
             "opencv": cv2.__version__,
@@ -116,7 +146,7 @@ def pytest_terminal_summary(terminalreporter, config):
             "calls": total,
             "known": n_known,
             "unexpected": len(unexpected),
-            "tests": len(terminalreporter.stats.get("passed", [])),
-            "failed": failed,
+            "tests": n_passed,
+            "failed": len(failed),
         }
         Path(target).write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import multiprocessing
-import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,8 @@ from compat.cases import CASES, Case
 
 #: Seconds that one call may take.
 TIME_LIMIT = 25.0
+
+Task = Callable[[Any, str], Any]
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ def observe(function: Any, case: Case) -> Outcome:
     except Exception as error:
         return Outcome("error", f"{type(error).__name__}: {error}")
     if type(answer) is not tuple or len(answer) != 2:
-        return Outcome("error", f"no pair but {answer!r:.80}")
+        return Outcome("error", f"nothing, but returns no tuple (F, mask): {type(answer).__name__}")
     F, mask = answer
     same = [_equal(old, _array(new)) for old, new in zip(before, (*inputs, given), strict=True)]
     return Outcome(
@@ -105,20 +107,27 @@ def observe(function: Any, case: Case) -> Outcome:
     )
 
 
-def _child(name: str, ids: list[str], pipe: Any) -> None:
+def _observe_case(function: Any, id_: str) -> Outcome:
+    return observe(function, CASES[id_])
+
+
+def _child(task: Task, name: str, ids: list[str], pipe: Any) -> None:
     function = implementation.load(name)
     for id_ in ids:
-        pipe.send(observe(function, CASES[id_]))
+        pipe.send(task(function, id_))
 
 
-def observe_all(name: str, ids: Iterable[str]) -> dict[str, Outcome]:
-    """Make the calls one after another in a child process, a new one after each crash or hang."""
+def in_children(task: Task, name: str, ids: Iterable[str]) -> dict[str, Any]:
+    """Do one task after another in a child process, and go on in a new one after a crash or a hang.
+
+    ``task(function, id_)`` is a function of a module; its results travel between the processes.
+    """
     waiting = list(ids)
-    found: dict[str, Outcome] = {}
+    found: dict[str, Any] = {}
     context = multiprocessing.get_context("spawn")
     while waiting:
         ours, theirs = context.Pipe(duplex=False)
-        child = context.Process(target=_child, args=(name, waiting, theirs), daemon=True)
+        child = context.Process(target=_child, args=(task, name, waiting, theirs), daemon=True)
         child.start()
         theirs.close()
         try:
@@ -131,7 +140,9 @@ def observe_all(name: str, ids: Iterable[str]) -> dict[str, Outcome]:
                     outcome = ours.recv()
                 except EOFError:
                     child.join()
-                    found[waiting.pop(0)] = Outcome("crash", f"exit code {child.exitcode}")
+                    found[waiting.pop(0)] = Outcome(
+                        "crash", f"the process died, exit code {child.exitcode}"
+                    )
                     break
                 found[waiting.pop(0)] = outcome
         finally:
@@ -141,20 +152,15 @@ def observe_all(name: str, ids: Iterable[str]) -> dict[str, Outcome]:
     return found
 
 
-def observe_both(ids: Iterable[str]) -> tuple[dict[str, Outcome], dict[str, Outcome]]:
-    """Outcomes of the implementation under test and of cv2, side by side in two processes."""
+def in_both(task: Task, ids: Iterable[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Do the tasks with the implementation under test and with cv2, side by side."""
     ids = list(ids)
-    results: dict[str, dict[str, Outcome]] = {}
+    with ThreadPoolExecutor(2) as pool:
+        names = (implementation.NAME, "cv2:findFundamentalMat")
+        ours, cv2s = pool.map(lambda name: in_children(task, name, ids), names)
+    return ours, cv2s
 
-    def work(key: str, name: str) -> None:
-        results[key] = observe_all(name, ids)
 
-    threads = [
-        threading.Thread(target=work, args=("ours", implementation.NAME)),
-        threading.Thread(target=work, args=("cv2s", "cv2:findFundamentalMat")),
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    return results["ours"], results["cv2s"]
+def observe_both(ids: Iterable[str]) -> tuple[dict[str, Outcome], dict[str, Outcome]]:
+    """Outcomes of the calls of the table, the implementation's under test and cv2's."""
+    return in_both(_observe_case, ids)

@@ -12,6 +12,17 @@ from compat.versions import EXACT_ARITHMETIC
 
 USAC = range(cv2.USAC_DEFAULT, cv2.USAC_MAGSAC + 1)
 
+RULES = {
+    "all": "all matches",
+    "ransac": "matches whose larger squared distance from the two epipolar lines, rounded to "
+    "float32, is at most the squared threshold (3 for a threshold of 0 or less)",
+    "lmeds": "matches whose larger squared distance from the two epipolar lines, rounded to "
+    "float32, is at most the square of 2.5 * 1.4826 * (1 + 5 / (n - 7)) * sqrt(their median), "
+    "whatever the threshold",
+    "usac": "matches whose squared Sampson distance, in float32 throughout, is less than the "
+    "squared threshold",
+}
+
 
 def rule_of(method: int | None, n: int) -> str | None:
     """Name the rule cv2 masks ``n`` points by; ``method`` is None for ``UsacParams``."""

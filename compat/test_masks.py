@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from compat import implementation
+from compat import implementation, versions
 from compat.cases import CASES, halves
 from compat.cases import METHODS as ALL_METHODS
 from compat.implementation import under_test
-from compat.rules import rule_of, squared_residuals, wrong_flags
+from compat.rules import RULES, rule_of, squared_residuals, wrong_flags
 from compat.scenes import scene
 
 #: The robust ones: the direct solvers call every match an inlier.
@@ -22,14 +22,26 @@ METHODS = {name: flag for name, flag in ALL_METHODS.items() if flag not in (1, 2
 )
 def test_mask_is_the_rule_applied_to_F(run, id_):
     case, outcome = CASES[id_], run.ours[id_]
-    if outcome.kind != "answer" or outcome.F is None:
-        if outcome.kind == "answer" and outcome.mask is not None and case.rule == "all":
-            assert outcome.mask.all()
+    if outcome.kind == "answer" and outcome.mask is not None:
+        hold_rule(outcome.F, case.X, outcome.mask, case.rule, case.threshold)
+
+
+def hold_rule(F, X, mask, rule, threshold):
+    """Fail, and say by which rule, if a flag is wrong. Without F only "all" has one."""
+    if F is None and rule != "all":
         return
-    if outcome.F.shape != (3, 3) and case.rule != "all":
-        pytest.fail(f"F has the shape {outcome.F.shape}")
-    assert set(np.unique(outcome.mask)) <= {0, 1}
-    assert wrong_flags(outcome.F, case.X, outcome.mask, case.rule, case.threshold) == 0
+    if rule != "all" and F.shape != (3, 3):
+        pytest.fail(f"F has the shape {F.shape}", pytrace=False)
+    others = sorted({*np.unique(mask).tolist()} - {0, 1})
+    if others:
+        pytest.fail(f"the mask has values that are neither 0 nor 1: {others[:5]}", pytrace=False)
+    wrong = wrong_flags(F, X, mask, rule, threshold)
+    if wrong:
+        pytest.fail(
+            f"{wrong} of {len(X)} flags are not what the rule {rule!r} makes of the F returned: "
+            f"inliers are {RULES[rule]}; the threshold was {threshold}",
+            pytrace=False,
+        )
 
 
 @pytest.mark.parametrize(
@@ -45,7 +57,13 @@ def test_no_model_means_no_inliers(run, id_):
     """A caller who sums the mask before looking at F must not find inliers."""
     outcome = run.ours[id_]
     if outcome.kind == "answer" and outcome.F is None and outcome.mask is not None:
-        assert not outcome.mask.any()
+        set_ = np.count_nonzero(outcome.mask)
+        if set_:
+            pytest.fail(
+                f"F is None, but {set_} of {outcome.mask.size} flags are set: "
+                "cv2's own mask is uninitialised memory here (OpenCV issues 9665, 5551)",
+                pytrace=False,
+            )
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -58,10 +76,11 @@ def test_exact_on_many_scenes(name):
         F, mask = under_test(*halves(X), method, threshold, 0.99, 300)
         if F is not None:
             points += len(X)
-            assert wrong_flags(F, X, mask, rule_of(method, len(X)), threshold) == 0
+            hold_rule(F, X, mask, rule_of(method, len(X)), threshold)
     assert points > 2_000
 
 
+@pytest.mark.skipif(not versions.EXACT_ARITHMETIC, reason="the last bit is not known here")
 @pytest.mark.parametrize("name", ["FM_RANSAC", "USAC_FAST", "USAC_MAGSAC"])
 def test_a_point_exactly_on_the_threshold(name):
     """Put the threshold on a residual: FM_RANSAC counts the point in, USAC counts it out."""
@@ -74,14 +93,13 @@ def test_a_point_exactly_on_the_threshold(name):
         for limit in error[np.searchsorted(error, 4.0) - np.arange(1, 4)]:
             threshold = float(np.sqrt(limit))
             F, mask = under_test(*halves(X), method, threshold, 0.99, 300)
-            residuals = squared_residuals(F, X, rule)
-            on_it = residuals.astype(np.float64) == np.float32(threshold * threshold)
+            on_it = squared_residuals(F, X, rule).astype(np.float64) == threshold * threshold
             hits += np.count_nonzero(on_it)
-            assert wrong_flags(F, X, mask, rule, threshold) == 0
-            if rule == "ransac":
-                assert mask.ravel()[on_it].all()
-    if implementation.IS_CV2:
-        assert hits > 0
+            hold_rule(F, X, mask, rule, threshold)
+            assert mask.ravel()[on_it].all() if rule == "ransac" else not mask.ravel()[on_it].any()
+    if not hits and implementation.NAME != implementation.DEFAULT and not implementation.IS_CV2:
+        pytest.skip("no residual came to lie on the threshold, for F depends on it")
+    assert hits
 
 
 def test_predict_has_the_same_rule():
@@ -93,7 +111,7 @@ def test_predict_has_the_same_rule():
         estimator = estimators.FundamentalMatrixEstimator(method=name, threshold=1.5).fit(X)
         mask = estimator.predict(X)
         assert mask.dtype == bool
-        assert wrong_flags(estimator.F_, X, mask, rule_of(method, len(X)), 1.5) == 0
+        hold_rule(estimator.F_, X, mask, rule_of(method, len(X)), 1.5)
 
 
 def test_given_mask_feeds_recover_pose():

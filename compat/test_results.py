@@ -10,7 +10,7 @@ from compat.cases import CASES
 
 @pytest.mark.parametrize("id_", [id_ for id_, case in CASES.items() if not case.refused])
 def test_same_form_as_cv2(run, id_):
-    assert not run.unexpected(id_)
+    run.hold(id_)
 
 
 @pytest.mark.whole_table

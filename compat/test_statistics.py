@@ -59,6 +59,42 @@ def test_no_worse_than_cv2(kind, method):
     assert np.median(ours) <= 1.1 * np.median(cv2s)
 
 
+def test_prosac_makes_use_of_the_order():
+    """Of one right match in ten PROSAC finds F, if the right ones come first."""
+    ours, cv2s = [], []
+    for seed in range(20):
+        X, inliers, _ = scene(500, 0.1, 0.5, seed)
+        exact, _, _ = scene(500, 0.1, 0.0, seed)
+        best_first = np.argsort(~inliers, kind="stable")
+        for found, function in ((ours, under_test), (cv2s, reference)):
+            F, _ = function(*halves(X[best_first]), cv2.USAC_PROSAC, 1.5, 0.99, 500)
+            found.append(epipolar_error(F, exact[inliers].astype(float)))
+    assert np.max(cv2s) < 5, "the scenes say nothing"
+    assert np.max(ours) < 5
+    assert np.median(ours) <= 1.1 * np.median(cv2s)
+
+
+def rank_3(F, X):
+    """Smallest part of F that is of rank 3, where the points are around 0 and of size 1."""
+    frames = []
+    for points in (X[:, :2].astype(float), X[:, 2:].astype(float)):
+        centre, size = points.mean(0), points.std()
+        frames.append(np.array([[size, 0, centre[0]], [0, size, centre[1]], [0, 0, 1]]))
+    values = np.linalg.svd(frames[1].T @ F @ frames[0], compute_uv=False)
+    return values[2] / values[0]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_has_rank_2(method):
+    """USAC_FM_8PTS does not: cv2 leaves its F as it is."""
+    for seed in range(10):
+        for n, inlier_ratio in ((12, 1.0), (60, 0.7), (300, 0.5)):
+            X = scene(n, inlier_ratio, seed=seed)[0]
+            F, _ = under_test(*halves(X), METHODS[method], 1.5, 0.99, 300)
+            assert F is not None
+            assert rank_3(F, X) < 1e-6
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_flags_the_right_matches(method):
     for seed in range(5):
