@@ -228,6 +228,19 @@ def test_no_matrix_is_held(kernel):
     assert peak < 6000 * 6000 * 8 / 6
 
 
+def test_delta_is_found_among_few_of_all_pairs():
+    X = np.random.default_rng(0).uniform(size=(6000, 4))
+    parts, looked_at = _density._parts, []
+
+    def counted(rows, width):
+        looked_at.append(len(rows) * width)
+        return parts(rows, width)
+
+    with mock.patch.object(_density, "_parts", counted):
+        density_peaks(X, dc=0.2)
+    assert 6000 < sum(looked_at) < 6000 * 6000 / 10
+
+
 @pytest.mark.parametrize("percent", [0.5, 2.0, 10.0])
 def test_sampled_dc_stays_within_its_stated_error(percent):
     X = 100 + np.random.default_rng(1).normal(size=(4001, 4))
