@@ -90,11 +90,15 @@ SAME = {
         call(WHOLE1, WHOLE2, 8),
     ),
     "int64 wraps to int32": (
-        call(WHOLE1.astype("i8") + 2**33, WHOLE2.astype("i8") - 2**33, 8),
+        call(
+            (WHOLE1.astype("f8") + 2.0**33).astype("i8"),
+            (WHOLE2.astype("f8") - 2.0**33).astype("i8"),
+            8,
+        ),
         call(WHOLE1, WHOLE2, 8),
     ),
     "uint64 wraps to int32": (
-        call(WHOLE1.astype("u8") + 2**33, WHOLE2, 8),
+        call((WHOLE1.astype("f8") + 2.0**33).astype("u8"), WHOLE2, 8),
         call(WHOLE1, WHOLE2, 8),
     ),
     "one UMat is as two arrays": (call(cv2.UMat(P1), P2, 8), call(P1, P2, 8)),
