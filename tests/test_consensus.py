@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from cv_densityf import _consensus
+from cv_densityf import _consensus, _stopwatch
 from cv_densityf._consensus import (
     _Ballot,
     _noise,
@@ -198,6 +198,15 @@ def test_cameras_that_can_exist_win_over_a_few_more_votes(seed, monkeypatch):
     assert winner() == 1
 
 
+def test_votes_are_for_the_root_of_how_nearly_cameras_can_exist(monkeypatch):
+    scene = scene_of(0)
+    pool = _Pool(scene.X, np.ones(600), np.arange(600), 1.0, np.random.default_rng(0))
+    for ratio in (1.0, 0.49):
+        monkeypatch.setattr(_consensus, "essential_ratio", lambda F, r=ratio: np.full(len(F), r))
+        pool.add(scene.F[None], [50])
+    np.testing.assert_allclose(pool.votes[1], 0.7 * pool.votes[0])
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_local_optimisation_finds_more_votes_near_a_poor_hypothesis(seed):
     """A hypothesis that only a few crowded matches fixed gets better; it never gets worse."""
@@ -321,6 +330,18 @@ def test_scores_give_one_more_draw_in_their_order(monkeypatch):
     assert not any(best_first for *_, best_first in others)
 
 
+def test_equal_matches_keep_the_order_of_their_rows(monkeypatch):
+    """Numpy's default sort would order them by what the processor can do."""
+    seen = spied_draws(monkeypatch)
+    X = scene_of(0).X
+    level = np.random.default_rng(0).integers(3, size=600)
+    find(X, level / 2, scores=level)
+    ranked = X[sorted(range(600), key=lambda i: -level[i])]
+    for points, *_ in seen:
+        expected = ranked[: len(points)] - ranked[0]
+        np.testing.assert_allclose(points - points[0], expected, atol=1e-3)
+
+
 def test_the_draw_by_scores_is_a_hypothesis_like_the_others(monkeypatch):
     scene = scene_of(0)
     centre = scene.X.mean(axis=0)
@@ -353,6 +374,17 @@ def test_the_noise_narrows_later_draws(monkeypatch, noise, threshold, low, high)
     assert first == second == threshold
     assert len(set(later)) == 1
     assert low <= later[0] <= high
+
+
+def test_the_noise_is_told_by_the_reliable_half(monkeypatch):
+    """The first thirty matches are more exact than those, the last half less."""
+    seen = spied_draws(monkeypatch, _consensus.draw)
+    monkeypatch.setattr(_Pool, "agrees", lambda pool: False)
+    row = np.arange(600)
+    noise = np.select([row < 30, row < 300], [0.8, 1.6], 4.0)
+    X = true_matches(0, n=600) + np.random.default_rng(0).normal(size=(600, 4)) * noise[:, None]
+    find(X, 1.0 - row / 600, threshold=10.0)
+    assert seen[-1][1] == pytest.approx(4 * 1.6, rel=0.15)
 
 
 def test_draws_near_the_best_take_what_lies_within_eight_thresholds():
@@ -397,6 +429,38 @@ def test_the_unit_of_length_hardly_matters_to_the_search(factor):
     assert there < 1.2 * here
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("factor", [2.0**-7, 2.0**8])
+def test_the_unit_of_length_does_not_matter_to_what_is_made_of_the_draws(factor, seed, monkeypatch):
+    """A power of two leaves every rounding as it is."""
+
+    def fit(points, threshold, confidence, max_iters, seed):
+        rows = np.random.default_rng(seed).permutation(min(len(points), 60))[:12]
+        return eight_point(points[None, rows].astype(np.float64))[0]
+
+    monkeypatch.setattr(_consensus, "draw", fit)
+    X = scene_of(seed, inlier_ratio=0.6).X
+    reliability = contrast_reliability(X[:300])
+    zoom = np.diag([factor, factor, 1.0])
+    for others in (None, X[300:]):
+        here = find(X[:300], reliability, threshold=3.0, others=others)
+        scaled = None if others is None else factor * others
+        there = find(factor * X[:300], reliability, threshold=3.0 * factor, others=scaled)
+        np.testing.assert_allclose(there.votes, here.votes, rtol=1e-9)
+        back = zoom @ there.F @ zoom
+        np.testing.assert_allclose(
+            back / np.linalg.norm(back), here.F / np.linalg.norm(here.F), rtol=1e-6
+        )
+
+
+def test_where_no_two_draws_agree_the_best_is_optimised(monkeypatch):
+    X = scene_of(0, inlier_ratio=0.6).X
+    assert len(find(X).votes) == find(X).n_draws
+    monkeypatch.setattr(_Pool, "agrees", lambda pool: False)
+    found = find(X)
+    assert len(found.votes) == found.n_draws + _consensus._LOCAL_ROUNDS
+
+
 def test_local_optimisation_is_no_second_opinion():
     scene = scene_of(0, inlier_ratio=0.6)
     X = scene.X - scene.X.mean(axis=0)
@@ -406,6 +470,53 @@ def test_local_optimisation_is_no_second_opinion():
         pool.optimise()
     assert len(pool) == 4
     assert not pool.agrees()
+
+
+@pytest.mark.parametrize(("n", "n_fits"), [(15, 0), (16, 1)])
+def test_local_optimisation_takes_half_of_the_near_matches_and_no_fewer_than_eight(n, n_fits):
+    X = true_matches(0, n=n)
+    pool = _Pool(X - X.mean(axis=0), np.ones(n), np.arange(n), 1.0, np.random.default_rng(0))
+    pool.add(eight_point(pool._X[None]), [n])
+    pool.optimise()
+    assert len(pool) == 1 + n_fits
+
+
+def test_other_matches_give_f_what_a_part_cannot():
+    """Nearly what least squares makes of the right ones of them all."""
+    errors = []
+    for seed in range(10):
+        scene = scene_of(seed, n=4000, inlier_ratio=0.5, noise=0.8)
+        part, others = scene.X[:400], scene.X[400:]
+        F = find(part, others=others).F
+        best = least_squares(scene.X[scene.inliers], F)
+        errors.append([sampson_distance(f, true_matches(seed)).mean() for f in (F, best)])
+    searched, best = np.median(errors, axis=0)
+    assert searched < 2 * best
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_finalists_are_the_best_three_of_different_inliers(seed, monkeypatch):
+    """No two of them share .93 of the matches that either has."""
+    rng = np.random.default_rng(seed)
+    pool = _Pool(scene_of(0).X, np.ones(600), np.arange(600), 2.0, rng)
+    F = rng.normal(size=(24, 3, 3))
+    inliers = np.zeros((24, 600), dtype=bool)
+    for i, row in enumerate(inliers):
+        row[100 * (i % 4) : 100 * (i % 4) + rng.integers(100, 110)] = True
+    votes = rng.uniform(size=24)
+    pool._append(pool._frame.enter(F), np.where(inliers, 3.9, 4.1), votes, np.ones(24))
+    both, either = inliers[:, None] & inliers, inliers[:, None] | inliers
+    share = both.sum(axis=2) / either.sum(axis=2)
+    expected = []
+    for i in np.argsort(-votes):
+        if len(expected) < 3 and (share[i, expected] < 0.93).all():
+            expected.append(i)
+    monkeypatch.setattr(_consensus, "polish", lambda frame, G, scales: G)
+    wider = pool.before(scene_of(1).X)
+    finalists = wider._frame.leave(wider._G)
+    unit = finalists / np.linalg.norm(finalists, axis=(1, 2), keepdims=True)
+    wanted = F[expected] / np.linalg.norm(F[expected], axis=(1, 2), keepdims=True)
+    np.testing.assert_allclose(unit, wanted, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -432,14 +543,35 @@ def test_agreement_is_of_inliers_from_parts_of_other_sizes(common, more, sizes, 
     assert pool.agrees() == agree
 
 
-def test_the_reason_tells_of_agreement_and_the_watch_of_both_stages(monkeypatch):
+def test_the_reason_tells_of_agreement(monkeypatch):
     X = scene_of(0, inlier_ratio=0.9, noise=0.2).X
-    watch = Stopwatch()
-    found = search(X, contrast_reliability(X), seed=0, watch=watch, **ASKED)
+    found = find(X)
     assert found.reason.endswith(f" {found.n_draws} draws, found again by another")
-    assert set(watch.laps) == {"draws", "polish"}
     monkeypatch.setattr(_Pool, "agrees", lambda pool: False)
     assert find(X).reason.endswith(" draws")
+
+
+def test_the_watch_tells_draws_from_the_rest(monkeypatch):
+    """On a clock that a draw moves by a second, and a polish by a thousand."""
+    now = 0.0
+
+    def lasting(seconds, function):
+        def timed(*args):
+            nonlocal now
+            now += seconds
+            return function(*args)
+
+        return timed
+
+    monkeypatch.setattr(_consensus, "draw", lasting(1, _consensus.draw))
+    monkeypatch.setattr(_consensus, "polish", lasting(1000, _consensus.polish))
+    monkeypatch.setattr(_stopwatch, "perf_counter", lambda: now)
+    monkeypatch.setattr(_Pool, "agrees", lambda pool: False)
+    watch = Stopwatch()
+    X = scene_of(0).X
+    found = search(X, contrast_reliability(X), seed=0, watch=watch, **ASKED)
+    draws = 1000 * found.n_draws
+    assert watch.laps == {"draws": draws, "polish": 1000 * now - draws}
 
 
 # The vote
@@ -550,7 +682,8 @@ def test_noise_is_the_standard_deviation_of_the_right_ones_residuals(sigma, n_wr
 
 def test_noise_of_next_to_no_residuals_is_of_the_order_of_the_threshold():
     for squared in (np.array([]), np.full(30, 1e6)):
-        assert 0.1 < _noise(squared, 1.0) <= 1.0
+        for threshold in (0.3, 1.0, 7.0):
+            assert 0.1 < _noise(squared, threshold) / threshold <= 1.0
 
 
 def test_noise_among_wrong_matches_nearby():
@@ -599,6 +732,7 @@ def test_papers_ransac_ends_by_its_equation(seed):
     found = eight_point_ransac(X, threshold=0.5, confidence=0.99, max_iters=100_000, seed=seed)
     inliers = recount(found, X, 0.5)
     assert found.votes == (inliers,)
+    assert found.reason.startswith(f"{inliers} of the 300 matches ")
     assert inliers >= 160
     # The clean sample came before the number that it asks for had been drawn.
     assert found.n_draws == np.ceil(_samples_needed(inliers / 300, 0.99))
@@ -648,7 +782,8 @@ def test_papers_ransac_takes_eight_exact_matches_and_no_fewer_that_agree():
     assert eight_point_ransac(chance, **{**asked, "threshold": 1e-6}) is None
 
 
-def test_papers_ransac_draws_without_repetition_from_many(monkeypatch):
+@pytest.mark.parametrize("n", [10, 70])
+def test_papers_ransac_draws_evenly_and_without_repetition(n, monkeypatch):
     seen = []
 
     def recorded(samples):
@@ -656,29 +791,14 @@ def test_papers_ransac_draws_without_repetition_from_many(monkeypatch):
         return np.tile(np.eye(3), (len(samples), 1, 1))
 
     monkeypatch.setattr(_consensus, "eight_point", recorded)
-    X = np.arange(280.0).reshape(70, 4)
+    X = np.arange(4.0 * n).reshape(n, 4)
     eight_point_ransac(X, threshold=1e-9, confidence=0.99, max_iters=500, seed=0)
     rows = np.concatenate(seen)[:, :, 0] / 4
     assert rows.shape == (500, 8)
     assert all(len(set(row)) == 8 for row in rows)
-
-
-def test_papers_ransac_draws_without_repetition(monkeypatch):
-    seen = []
-
-    def recorded(samples):
-        seen.append(samples)
-        return np.tile(np.eye(3), (len(samples), 1, 1))
-
-    monkeypatch.setattr(_consensus, "eight_point", recorded)
-    X = np.arange(40.0).reshape(10, 4)
-    eight_point_ransac(X, threshold=1e-9, confidence=0.99, max_iters=500, seed=0)
-    rows = np.concatenate(seen)[:, :, 0] / 4
-    assert rows.shape == (500, 8)
-    assert all(len(set(row)) == 8 for row in rows)
-    counts = np.bincount(rows.ravel().astype(int), minlength=10)
-    spread = norm.ppf(1 - 1e-6) * np.sqrt(500 * 0.8 * 0.2)
-    np.testing.assert_allclose(counts, 400, atol=spread)
+    counts = np.bincount(rows.ravel().astype(int), minlength=n)
+    spread = norm.ppf(1 - 1e-6) * np.sqrt(500 * 8 / n * (1 - 8 / n))
+    np.testing.assert_allclose(counts, 500 * 8 / n, atol=spread)
 
 
 @pytest.mark.parametrize("n", [0, 7])
