@@ -306,6 +306,7 @@ class _Pool:
         G = self._G[[self.best]]
         noise = _noise(self._squared[self.best, self._reliable], self.threshold)
         width = max(_STRIDE_SIGMAS * noise, _NARROWEST * self.threshold)
+        step = G
         for _ in range(_STRIDES):
             step = polish(self._frame, G, [width])
             step *= np.sign(np.sum(step * G))

@@ -207,10 +207,10 @@ def essential_ratio(F: Floats, image_size: float = np.sqrt(12.0)) -> NDArray[np.
         Pixels. The default is that of points spread evenly, in a `Frame`.
     """
     zoom = np.array([image_size, image_size, 1.0])
-    U, S, Vt = np.linalg.svd(F * np.outer(zoom, zoom))
-    entries = (U[:, :, :2] * S[:, None, :2]) @ Vt[:, :2]
+    F = F * np.outer(zoom, zoom)
+    U, S, Vt = np.linalg.svd(F)
     # Of K'^T F K: the sum of the squared singular values, and twice their product.
-    total = _ENTRY_GAIN.T @ entries**2 @ _ENTRY_GAIN
+    total = _ENTRY_GAIN.T @ F**2 @ _ENTRY_GAIN
     epipole2, epipole1 = U[:, :, 2] ** 2 @ _COFACTOR_GAIN, Vt[:, 2] ** 2 @ _COFACTOR_GAIN
     twice = (
         2.0
