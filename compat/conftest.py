@@ -95,14 +95,20 @@ def grouped(pairs):
 
 
 def some(ids, limit=3):
-    more = f", and {len(ids) - limit:,} more" if len(ids) > limit else ""
-    return ", ".join(ids[:limit]) + more
+    more = f"; and {len(ids) - limit:,} more" if len(ids) > limit else ""
+    return "; ".join(ids[:limit]) + more
 
 
+@pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_terminal_summary(terminalreporter, config):
+    """Have the last word, after pytest's own list of failures."""
+    yield
     made = config.stash.get(_RUN, None)
-    if made is None:
-        return
+    if made is not None:
+        summarize(terminalreporter, config, made)
+
+
+def summarize(terminalreporter, config, made):
     stats = terminalreporter.stats
     failed = stats.get("failed", []) + stats.get("error", [])
     n_passed = len(stats.get("passed", []))

@@ -40,7 +40,7 @@ def differences(case: Case, ours: Outcome, cv2s: Outcome) -> dict[str, str]:
     if not case.unstable and (ours.F is None) != (cv2s.F is None):
         found["F"] = f"F is {_presence(ours.F)}, where cv2 has {_presence(cv2s.F)}"
     elif ours.F is not None and cv2s.F is not None and not _same_form(case, ours, cv2s):
-        found["F"] = f"F has {_contrast(ours.F_form, cv2s.F_form)}"
+        found["F"] = f"F: {_contrast(ours.F_form, cv2s.F_form)}"
     elif case.direct and ours.F is not None and cv2s.F is not None:
         scale = np.abs(np.nan_to_num(cv2s.F)).max()
         if not np.allclose(ours.F, cv2s.F, rtol=1e-6, atol=1e-9 * scale, equal_nan=True):
@@ -52,7 +52,7 @@ def differences(case: Case, ours: Outcome, cv2s: Outcome) -> dict[str, str]:
             found["scale"] = "F[2, 2] is not 1, as cv2's is"
     luck = case.unstable and (ours.F is None) != (cv2s.F is None)
     if ours.mask_form != cv2s.mask_form and not luck:
-        found["mask"] = f"the mask has {_contrast(ours.mask_form, cv2s.mask_form)}"
+        found["mask"] = f"mask: {_contrast(ours.mask_form, cv2s.mask_form)}"
     if ours.mask_is_given != cv2s.mask_is_given:
         found["mask="] = (
             "the array given as mask= is what is returned; cv2 returns another"
@@ -83,7 +83,7 @@ def _contrast(ours: Form | None, cv2s: Form | None) -> str:
         one, two = (
             "None" if form is None else f"{form.dtype} {form.shape}" for form in (ours, cv2s)
         )
-        return f"become {one}, cv2's {two}"
+        return f"{one}, cv2's {two}"
     return ", ".join(
         f"{field.name} {one}, cv2's {two}"
         for field in fields(Form)
