@@ -389,7 +389,7 @@ def test_the_noise_is_told_by_the_reliable_half(monkeypatch):
     assert 4.6 < seen[-1][1] < 6.5
 
 
-def test_draws_near_the_best_take_what_lies_within_eight_thresholds():
+def test_near_the_best_is_within_so_many_working_thresholds():
     scene = scene_of(0)
     X = scene.X - scene.X.mean(axis=0)
     pool = _Pool(X, np.ones(600), np.arange(600), 2.0, np.random.default_rng(0))
@@ -428,7 +428,7 @@ def test_the_unit_of_length_hardly_matters_to_the_search(factor):
         there = sampson_distance(find(factor * X, threshold=factor).F, factor * truth).mean()
         errors.append([here, there / factor])
     here, there = np.median(errors, axis=0)
-    assert there < 1.2 * here
+    assert there < 1.5 * here
 
 
 @pytest.mark.parametrize("seed", SEEDS)
