@@ -317,20 +317,23 @@ def estimate_fundamental(
         Name (``"ransac"``, ``"lmeds"``, ``"usac_magsac"``, ...) or cv2 constant. It decides the
         rule of the inlier mask, and the call that answers where density cannot help.
     threshold : float
-        Largest residual of an inlier, pixels, above 0; unused by ``"lmeds"``, which finds its own.
+        Largest residual of an inlier, pixels, in (1e-12, 1e6); unused by ``"lmeds"``, which finds
+        its own. It rules the mask: the search has one of its own, a hundredth of the points'
+        spread, within a factor of two of this one; ``density="paper"`` takes this one.
     confidence : float
         Of each draw to have found the best model, in (0, 1).
     max_iters : int
-        Bound on the iterations of a draw, at least 1.
+        Bound on the iterations of each draw, at least 1. The default rule's draws end after a few
+        thousand in any case, those of ``"paper"`` and of cv2's own call only here.
     density : {"contrast", "paper", "off"}
         Rule for the dense part: density contrast, Wu and Wan's rho * delta, or none.
     alpha : float
         For ``"paper"``: matches below ``alpha * rho_max * delta_max`` are dropped; in [0, 1].
     dc_percent : float
         For ``"paper"``: mean share of neighbours within the cut-off distance, percent, (0, 100].
-    scores : array-like, shape (n,), optional
+    scores : array-like, shape (n,) or (n, 1), optional
         Trust in each match, higher is better (1 - SIFT ratio, a matcher's confidence). Only the
-        order counts.
+        order counts, so infinities will do, but not NaN. ``"paper"`` and ``"off"`` use none.
     random_state : int
         Seed, in [0, 2^31).
 
@@ -364,13 +367,7 @@ def estimate_fundamental(
             f"points1 has {len(first)} points and points2 {len(second)}; "
             "row i of both must be one match"
         )
-    trust = None
-    if scores is not None:
-        trust = np.asarray(scores, dtype=np.float64).ravel()
-        if len(trust) != len(first):
-            raise ValueError(f"scores has {len(trust)} entries for {len(first)} matches")
-        if np.isnan(trust).any():
-            raise ValueError("scores has NaN; give matches of unknown trust the lowest score")
+    trust = None if scores is None else check_scores(scores, len(first))
     _check("threshold", threshold, Real, lambda v: 1e-12 < v < 1e6, "a number above 0, below 1e6")
     _check("confidence", confidence, Real, lambda v: 0 < v < 1, "a number inside (0, 1)")
     _check("max_iters", max_iters, Integral, lambda v: v >= 1, "an integer, at least 1")
@@ -393,6 +390,21 @@ def check_density(density: Any, alpha: Any, dc_percent: Any) -> None:
     _check("density", density, str, DENSITIES.__contains__, f"one of {', '.join(DENSITIES)}")
     _check("alpha", alpha, Real, lambda v: 0 <= v <= 1, "a number from 0 to 1")
     _check("dc_percent", dc_percent, Real, lambda v: 0 < v <= 100, "a number in (0, 100]")
+
+
+def check_scores(scores: ArrayLike, n: int | None) -> NDArray[np.float64]:
+    """Return the scores of n matches as (n,), or raise ValueError; n is None where unknown.
+
+    A column or a row will do, and so will infinities, since only the order counts.
+    """
+    trust = np.asarray(scores, dtype=np.float64)
+    if trust.ndim not in (1, 2) or trust.size not in trust.shape:
+        raise ValueError(f"scores has shape {trust.shape}; it must be (n,): one number a match")
+    if n is not None and trust.size != n:
+        raise ValueError(f"scores has {trust.size} entries for {n} matches")
+    if np.isnan(trust).any():
+        raise ValueError("scores has NaN; give matches of unknown trust the lowest score")
+    return trust.ravel()
 
 
 def _points(points: ArrayLike, name: str) -> NDArray[np.float64]:
