@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cv_densityf._engine import Robust, is_usac, original
 from cv_densityf._epipolar import inlier_mask
-from cv_densityf._estimate import LOG, MIN_FILTERED, Density, Estimate, check_density, run
+from cv_densityf._estimate import LOG, MIN_FILTERED, Density, Estimate, check_density, check_scores, run
 from cv_densityf._overloads import Call, resolve
 from cv_densityf._points import as_array, as_matches, as_umat, n_points
 
@@ -160,7 +160,7 @@ def findFundamentalMat(
     confidence : float, default 0.99
         Confidence wanted, inside (0, 1); other values are cv2's own call.
     maxIters : int, default 1000
-        Most samples of a draw. cv2 takes it only together with the three before it.
+        Bound on the samples of each draw. cv2 takes it only together with the three before it.
     mask : array, optional
         Output array, used as cv2 uses it: a writable contiguous uint8 (N, 1) array is filled and
         returned.
@@ -172,12 +172,14 @@ def findFundamentalMat(
         points explains; on the density peaks of [1]_; or no filter: cv2's own call.
     alpha : float, default 0.011
         Only for ``density="paper"``: a match is kept when its ``rho * delta`` reaches ``alpha``
-        times the largest ``rho`` times the largest ``delta``. At least 0.
+        times the largest ``rho`` times the largest ``delta``. In [0, 1].
     dc_percent : float, default 2.0
         Only for ``density="paper"``: mean number of neighbours within the cut-off distance, in per
         cent of N. Inside (0, 100].
-    scores : (N,) array_like of float, optional
-        Trust in each match, higher is better: 1 - SIFT ratio, or a matcher's confidence.
+    scores : (N,) or (N, 1) array_like of float, optional
+        Trust in each match, higher is better: 1 - SIFT ratio, or a matcher's confidence. Only the
+        order counts, so infinities will do, but not NaN. ``density="paper"`` and cv2's own calls
+        use none.
 
     Returns
     -------
@@ -203,9 +205,13 @@ def findFundamentalMat(
     Notes
     -----
     On the default path the threshold, the confidence and the seed of ``params`` count, its sampler
-    only as far as PROSAC's means that the rows come best first. A draw ends after at most
-    ``maxIters`` samples and after 1,000; there are up to eleven draws. Of more than 5,000 matches a
-    seeded 5,000 are searched; up to 100,000 choose and refine the result, and the mask is over all.
+    only as far as PROSAC's means that the rows come best first. The threshold rules the mask; the
+    search has one of its own, a hundredth of the points' spread, within a factor of two of it.
+    There are up to eleven draws, and each ends after at most ``maxIters`` and a few thousand
+    samples. ``density="paper"`` draws at the threshold given, and up to ``maxIters`` samples.
+
+    Of more than 5,000 matches a seeded 5,000 are searched; up to 100,000 choose and refine the
+    result, and the mask is over all.
 
     Deliberate differences from cv2: where ``FM_RANSAC`` and ``FM_LMEDS`` find no model cv2 returns
     uninitialised memory as the mask and leaves a given ``mask`` as it was; here both are zeros.
@@ -251,7 +257,7 @@ def find(
     usac = call.params is not None or is_usac(call.method)
     points1, points2 = as_array(call.points1), as_array(call.points2)
     n = None if points1 is None or points2 is None else _common_length(points1, points2, usac)
-    trust = None if scores is None else _check_scores(scores, n)
+    trust = None if scores is None else check_scores(scores, n)
     if points1 is None or points2 is None or n is None:
         answer = _cv2s_answer(call, None, usac, args, kwargs)
         return _passed_on(answer, None, density, start)
@@ -439,13 +445,3 @@ def _no_model(call: Call, n: int, usac: bool, slot: _MaskSlot) -> tuple[None, An
     # cv2's direct solvers count every point as an inlier, model or not.
     direct = not usac and (n == 7 or call.method == cv2.FM_8POINT)
     return None, slot.deliver(np.full(n, direct))
-
-
-def _check_scores(scores: ArrayLike, n: int | None) -> NDArray[np.float64]:
-    trust = np.asarray(scores, dtype=np.float64)
-    if trust.ndim != 1 or (n is not None and len(trust) != n):
-        rows = "one number" if n is None else f"{n} numbers, one"
-        raise ValueError(f"scores must be {rows} for each match, not shape {trust.shape}")
-    if not np.isfinite(trust).all():
-        raise ValueError("scores must be finite; give untrusted matches a low score")
-    return trust

@@ -16,6 +16,7 @@ import pytest
 from cv_densityf import cv2_api
 from cv_densityf._engine import original
 from cv_densityf._epipolar import inlier_mask
+from cv_densityf._estimate import estimate_fundamental
 from cv_densityf._overloads import resolve
 from cv_densityf.cv2_api import findFundamentalMat
 from cv_densityf.datasets import two_view_scene
@@ -673,9 +674,11 @@ def test_two_hundred_thousand_points():
         ({"alpha": np.nan}, "alpha is"),
         ({"dc_percent": 0}, "dc_percent is"),
         ({"dc_percent": 101}, "dc_percent is"),
-        ({"scores": np.ones(149)}, "150 numbers, one for each match"),
-        ({"scores": np.ones((150, 1))}, "150 numbers, one for each match"),
-        ({"scores": np.full(150, np.nan)}, "scores must be finite"),
+        ({"scores": np.ones(149)}, "scores has 149 entries for 150 matches"),
+        ({"scores": np.ones((75, 2))}, r"scores has shape \(75, 2\); it must be \(n,\)"),
+        ({"scores": np.ones((150, 1, 1))}, "scores has shape"),
+        ({"scores": 1.0}, "scores has shape"),
+        ({"scores": np.full(150, np.nan)}, "scores has NaN; give .* the lowest score"),
     ],
     ids=str,
 )
@@ -683,6 +686,26 @@ def test_two_hundred_thousand_points():
 def test_wrong_options_raise(options, message, method):
     with pytest.raises(ValueError, match=message):
         findFundamentalMat(P1, P2, method, **options)
+
+
+@pytest.mark.parametrize("estimate", [findFundamentalMat, estimate_fundamental])
+def test_of_scores_only_the_order_counts(estimate):
+    """Whatever holds one number a match will do, and infinity is a number to be ordered by."""
+    scene = two_view_scene(300, inlier_ratio=0.15, random_state=4)
+    scores = scene.inliers + np.random.default_rng(0).random(300)
+
+    def found(**given):
+        answer = estimate(scene.points1, scene.points2, **given)
+        return answer[0] if isinstance(answer, tuple) else answer.F
+
+    expected = found(scores=scores)
+    assert not np.array_equal(expected, found())
+    best, worst = scores.argmax(), scores.argmin()
+    infinite = scores.copy()
+    infinite[[best, worst]] = np.inf, -np.inf
+    others = (scores[:, None], scores[None], infinite, np.argsort(np.argsort(scores)).tolist())
+    for same in others:
+        np.testing.assert_array_equal(found(scores=same), expected)
 
 
 def test_scores_decide_where_density_cannot():
