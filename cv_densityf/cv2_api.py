@@ -14,7 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from cv_densityf._engine import Robust, is_usac, original
 from cv_densityf._epipolar import inlier_mask
-from cv_densityf._estimate import LOG, MIN_FILTERED, Density, Estimate, check_density, check_scores, run
+from cv_densityf._estimate import (
+    LOG,
+    MIN_FILTERED,
+    Density,
+    Estimate,
+    check_density,
+    check_scores,
+    run,
+)
 from cv_densityf._overloads import Call, resolve
 from cv_densityf._points import as_array, as_matches, as_umat, n_points
 
