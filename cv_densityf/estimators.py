@@ -299,9 +299,10 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
             Matches x, y, x', y', in pixels. ``rule="paper"`` takes any number of columns.
         y : ignored
         sample_weight : array_like, shape (n,), optional
-            Trust in each row, higher is better; only its order counts. Rows are then ordered by
-            the mean of their rank by density and their rank by weight, which is
-            ``reliability_``; as many are kept as without.
+            Trust in each row, finite, higher is better; only its order counts. Rows are then
+            ordered by a sum in which the rank by density counts twice that by weight, as for the
+            ``scores`` of `cv_densityf.estimate_fundamental`; ``reliability_`` is the rank of that
+            sum, and as many rows are kept as without.
 
         Returns
         -------
@@ -334,7 +335,7 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
         else:
             reliability, support = paper_support(matches, self.alpha, self.dc_percent)
         if weight is not None:
-            reliability = (ranks(reliability) + ranks(weight)) / 2
+            reliability = ranks(2 * ranks(reliability) + ranks(weight))
         if weight is not None or self.keep is not None:
             n_kept = round(self.keep * n) if self.keep is not None else np.count_nonzero(support)
             support = np.zeros(n, dtype=bool)
@@ -416,11 +417,14 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         cv2's method: "ransac", "lmeds", "8point", "7point", "usac_default", "usac_parallel",
         "usac_fm_8pts", "usac_fast", "usac_accurate", "usac_prosac", "usac_magsac", or its constant.
     threshold : float > 0, default=1.0
-        Largest distance of an inlier, in pixels. "lmeds" finds its own.
+        Largest distance of an inlier, in pixels. "lmeds" finds its own. It rules the masks: the
+        search of ``prefilter="auto"`` has a threshold of its own, a hundredth of the points'
+        spread, within a factor of two of this one.
     confidence : float in (0, 1), default=0.999
         Wanted probability that the result is right.
     max_iters : int >= 1, default=5000
-        Most samples drawn.
+        Bound on the iterations of each draw; those of ``prefilter="auto"`` end after a few thousand
+        in any case.
     random_state : int, RandomState or None, default=0
         Seed of the pipeline of ``prefilter="auto"``. None takes one from numpy's global state.
         A plain call of cv2 has a fixed seed of its own.
@@ -513,9 +517,9 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
             Matches x, y, x', y', in pixels, n >= 8.
         y : ignored
         sample_weight : array_like, shape (n,), optional
-            Trust in each match, higher is better, such as 1 - SIFT ratio. "auto" uses it as its
-            ``scores``; a prefilter gets it where its ``fit`` has such a parameter; a plain call
-            of cv2 has no use for it.
+            Trust in each match, finite, higher is better, such as 1 - SIFT ratio; only its order
+            counts. "auto" uses it as its ``scores``; a prefilter gets it where its ``fit`` has such
+            a parameter; a plain call of cv2 has no use for it.
         **params
             Metadata for the prefilter's ``fit``, where metadata routing is enabled.
 

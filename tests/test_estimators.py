@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 import sklearn
 from imblearn.pipeline import make_pipeline as make_imblearn_pipeline
+from scipy.stats import rankdata
 from sklearn.base import BaseEstimator, clone
 from sklearn.ensemble import IsolationForest
 from sklearn.exceptions import NotFittedError
@@ -430,6 +431,23 @@ def test_weights_reorder_and_keep_the_number():
         np.argsort(equal.reliability_, kind="stable"),
         np.argsort(by_rule.reliability_, kind="stable"),
     )
+
+
+def test_weights_count_as_scores_do_in_the_pipeline():
+    scene = two_view_scene(300, inlier_ratio=0.4)
+    trust = np.random.default_rng(0).random(300)
+    estimate = estimate_fundamental(scene.points1, scene.points2, scores=trust)
+    fitted = DensityPeaksFilter().fit(scene.X, sample_weight=trust)
+    np.testing.assert_array_equal(fitted.reliability_, estimate.reliability)
+
+
+def test_weight_counts_half_as_much_as_the_density_of_the_paper():
+    rng = np.random.default_rng(3)
+    X, weight = rng.normal(size=(40, 4)) * 100, rng.integers(0, 10, 40)
+    by_density = DensityPeaksFilter("paper").fit(X).reliability_
+    by_both = rankdata(2 * rankdata(by_density) + rankdata(weight))
+    fitted = DensityPeaksFilter("paper").fit(X, sample_weight=weight)
+    np.testing.assert_allclose(fitted.reliability_, (by_both - 1) / 39, rtol=1e-12)
 
 
 def test_too_few_rows_left_keeps_all(scene):
