@@ -642,9 +642,8 @@ def masks() -> Iterator[Case]:
                 sampled and situation != "nothing found"
             )
             third = params() if method is None else method
-            # UsacParams that find nothing give the caller's mask back as it was, and nobody but
-            # cv2 before 4.9 writes to a read-only one.
-            untouched = situation == "nothing found" and (method is None or name == "read-only")
+            # Nobody but cv2 before 4.9 writes to a read-only one.
+            untouched = situation == "nothing found" and name == "read-only"
             yield Case(
                 f"masks/{name}, {situation}/{method_name}",
                 lambda make=make, p1=p1, p2=p2, third=third: ((p1, p2, third), {"mask": make()}),

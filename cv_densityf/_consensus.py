@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cv_densityf._engine import draw
 from cv_densityf._epipolar import (
+    FAR,
     Frame,
     eight_point,
     essential_ratio,
@@ -33,6 +34,8 @@ MIN_DRAW = 30
 #: cv2's iterations in one draw from a quarter of the matches, and less from larger, less pure
 #: parts. More find no better F; several short draws do.
 MAX_DRAW_ITERS = 1000
+#: cv2's iterations in the draw that follows the caller's scores through all matches.
+MAX_RANKED_ITERS = 5 * MAX_DRAW_ITERS
 #: Two hypotheses agree when their inlier sets have this intersection over union.
 _AGREEMENT = 0.93
 #: Draws from parts whose sizes differ by less than this factor are not independent.
@@ -64,10 +67,10 @@ _FINALISTS = 3
 _STRIDES = 10
 _STRIDE = 3.0
 _STRIDE_SIGMAS = 1.4
-#: Noise may exceed the caller's threshold; residuals beyond this many of it are wrong matches.
+#: Noise may exceed the threshold; residuals beyond this many of it are wrong matches.
 _WIDEST = 3.0
 #: A working threshold of this many robust standard deviations of the residuals lets nearly every
-#: inlier vote; it never exceeds the caller's threshold and never falls below a part of it.
+#: inlier vote; it never exceeds the threshold and never falls below a part of it.
 _SIGMAS = 4.0
 _SMALLEST_SCALE = 0.25
 #: Eight-point samples solved at a time.
@@ -110,8 +113,10 @@ def search(
         Finite matches.
     reliability : array, shape (n,)
         Weight of each match's vote, in [0, 1]; also the order of the draws.
-    threshold, confidence, max_iters
-        As for cv2, threshold in pixels.
+    threshold : float
+        Of the draws, pixels. The mask has one of its own, the caller's.
+    confidence, max_iters
+        As for cv2.
     seed : int
         Where the draws' random numbers start.
     watch : Stopwatch
@@ -140,7 +145,8 @@ def search(
     found, sizes = [], []
     if scores is not None:
         ranked = X[np.argsort(-scores, kind="stable")].astype(np.float32)
-        F = draw(ranked, threshold, confidence, max_iters, seed, best_first=True)
+        iters = min(max_iters, MAX_RANKED_ITERS)
+        F = draw(ranked, threshold, confidence, iters, seed, best_first=True)
         n_draws = 1
         if F is not None:
             found.append(F)
@@ -186,8 +192,8 @@ def search(
 class _Pool:
     """Polished hypotheses, their residuals and votes.
 
-    ``working`` is the threshold of draws and votes, pixels: the caller's, or a part of it where the
-    noise is smaller. The caller's threshold rules the mask; the width of the noise is the data's.
+    ``working`` is the threshold of draws and votes, pixels: the one given, or a part of it where
+    the noise is smaller.
     """
 
     def __init__(
@@ -205,7 +211,9 @@ class _Pool:
         self._reliable = reliable
         self._rng = rng
         self._frame = Frame(X)
-        self._ballot = _Ballot(X, reliability)
+        # What lies far out must not make the cells so large that all others share one.
+        reach = FAR / self._frame.scale
+        self._ballot = _Ballot(X.clip(-reach, reach), reliability)
         self._G: Floats = np.empty((0, 3, 3))
         self._squared: Floats = np.empty((0, len(X)))
         self._sizes: Floats = np.empty(0)
@@ -263,6 +271,9 @@ class _Pool:
             return
         keys = self._rng.random((_LOCAL_SAMPLES, len(near)))
         F = eight_point(self._X[near[keys.argpartition(size - 1, axis=1)[:, :size]]])
+        F = F[np.isfinite(F).all(axis=(1, 2))]  # nothing fits the copies of one match
+        if not len(F):
+            return
         part = self._frame.part(self.near_best(_LOCAL_REACH))
         G = polish(part, part.enter(F), [_POLISH_WIDTH * self.working] * _LOCAL_STEPS)
         squared, votes = self._poll(G)

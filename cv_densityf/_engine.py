@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Integral
 from typing import Any
 
@@ -53,7 +53,7 @@ def method_flag(method: str | int) -> int:
         name = method.lower().removeprefix("fm_")
         if name in METHODS:
             return METHODS[name]
-    elif isinstance(method, Integral) and method in METHODS.values():
+    elif isinstance(method, Integral) and type(method) is not bool and method in METHODS.values():
         return int(method)
     raise ValueError(f"unknown method {method!r}; choose one of {', '.join(METHODS)}")
 
@@ -69,6 +69,27 @@ def method_name(robust: Robust) -> str:
 def is_usac(flag: int) -> bool:
     """Whether cv2 sends this method to its USAC framework."""
     return flag in _USAC_FLAGS
+
+
+def cuts_graph(flag: int, params: cv2.UsacParams | None) -> bool:
+    """Whether cv2 optimises locally by graph cut."""
+    if params is not None:
+        return bool(params.loMethod == cv2.LOCAL_OPTIM_GC)
+    return flag == cv2.USAC_ACCURATE
+
+
+def without_graph_cut(
+    flag: int, params: cv2.UsacParams | None
+) -> tuple[int, cv2.UsacParams | None]:
+    """Return the same settings with another local optimisation."""
+    if params is None:
+        return cv2.USAC_DEFAULT, None
+    other = cv2.UsacParams()
+    for name in dir(other):
+        if not name.startswith("_"):
+            setattr(other, name, getattr(params, name))
+    other.loMethod = cv2.LOCAL_OPTIM_INNER_AND_ITER_LO
+    return flag, other
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,25 +116,24 @@ class Robust:
             return bool(self.params.sampler == cv2.SAMPLING_PROSAC)
         return self.flag == cv2.USAC_PROSAC
 
+    def for_size(self, n: int) -> Robust:
+        """Return these settings, or those without graph cut if n matches are too many for it."""
+        if n <= GRAPH_CUT_MAX or not cuts_graph(self.flag, self.params):
+            return self
+        flag, params = without_graph_cut(self.flag, self.params)
+        return replace(self, flag=flag, params=params)
+
     def plain(
         self, points1: Any, points2: Any
     ) -> tuple[NDArray[np.float64] | None, NDArray[np.uint8] | None]:
-        """Make cv2's own call; (None, None) where its solver raises or finds nothing.
-
-        Where cv2 would cut graphs over more than `GRAPH_CUT_MAX` matches, USAC_DEFAULT answers.
-        """
-        flag, params = self.flag, self.params
-        if len(points1) > GRAPH_CUT_MAX and (
-            flag == cv2.USAC_ACCURATE
-            or (params is not None and params.loMethod == cv2.LOCAL_OPTIM_GC)
-        ):
-            flag, params = cv2.USAC_DEFAULT, None
+        """Make cv2's own call; (None, None) where its solver raises or finds nothing."""
+        params = self.params
         try:
             if params is not None:
                 F, mask = original(points1, points2, params)
             else:
                 F, mask = original(
-                    points1, points2, flag, self.threshold, self.confidence, self.max_iters
+                    points1, points2, self.flag, self.threshold, self.confidence, self.max_iters
                 )
         except cv2.error:
             return None, None
@@ -152,6 +172,6 @@ def draw(
         F, _ = original(points[:, :2], points[:, 2:], params)
     except cv2.error:
         return None
-    if F is None or not np.isfinite(F).all():
+    if F is None or not np.isfinite(F).all() or not F.any():
         return None
     return np.asarray(F, dtype=np.float64)

@@ -160,7 +160,7 @@ def middle(X: Floats) -> tuple[Floats, float]:
     away = np.abs(X - np.partition(X, half, axis=0)[half]).max(axis=1)
     # Three quarters and not half, since half may be copies of one match.
     most = 3 * len(X) // 4
-    reach = _FAR * np.partition(away, most)[most]
+    reach = FAR * np.partition(away, most)[most]
     near = X[away <= reach] if reach > 0 else X
     centre = near.mean(axis=0)
     return centre, float(np.sqrt(((near - centre) ** 2).mean()))
@@ -173,7 +173,7 @@ def shift(by: Floats) -> NDArray[np.float64]:
 
 _TINY = 1e-300
 #: Matches this many times as far out as three quarters of them cannot be in the image.
-_FAR = 5.0
+FAR = 5.0
 #: Generators of the rotations about the three axes.
 _SKEW = np.zeros((3, 3, 3))
 _SKEW[0, 2, 1] = _SKEW[1, 0, 2] = _SKEW[2, 1, 0] = 1.0

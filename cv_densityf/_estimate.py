@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cv_densityf._consensus import eight_point_ransac, search
 from cv_densityf._engine import Robust, method_flag, method_name
-from cv_densityf._epipolar import inlier_mask, middle
+from cv_densityf._epipolar import FAR, inlier_mask, middle
 from cv_densityf._prefilter import contrast_support, paper_support
 from cv_densityf._stopwatch import Stopwatch
 
@@ -153,7 +153,13 @@ def _estimate(
         rows = heard[_spread(X[heard], MAX_SEARCHED, rng)]
     Z = X[rows] if len(rows) < n else X
     if _on_a_line(Z[:, :2]) or _on_a_line(Z[:, 2:]):
-        return _plain(X, finite, robust, watch, "cv2's own call, since all points are on a line")
+        return _plain(
+            X,
+            finite,
+            robust,
+            watch,
+            "cv2's own call, since all points of an image are nearly on a line",
+        )
     trust = None if scores is None else scores[rows]
     if density == "paper":
         r, support = paper_support(Z, alpha, dc_percent)
@@ -227,6 +233,8 @@ def _spread(X: NDArray[np.float64], size: int, rng: np.random.Generator) -> NDAr
     if len(X) <= size:
         return np.arange(len(X))
     first, second = _CELLS
+    centre, deviation = middle(X[:: max(1, len(X) // MAX_SEARCHED)])
+    X = X.clip(centre - FAR * deviation, centre + FAR * deviation)
     cell = _winding(X[:, :2], first) * second**2 + _winding(X[:, 2:], second)
     order = np.argsort(cell.astype(np.uint16), kind="stable")
     edges = np.arange(size + 1) * len(X) // size
@@ -267,16 +275,24 @@ def _plain(
     reason: str,
 ) -> Estimate:
     """Answer as cv2 itself does on the finite matches."""
-    Z = X if finite.all() else X[finite]
+    n_finite = int(np.count_nonzero(finite))
+    heard = finite
+    if robust.rule == "ransac" and n_finite < MIN_FILTERED <= len(X):
+        # It would be another method on so few; RANSAC itself knows rows that are not numbers.
+        heard = np.ones_like(finite)
+    Z = X if heard.all() else X[heard]
+    asked, robust = robust, robust.for_size(len(Z))
+    if robust is not asked:
+        reason += ", without graph cut, which takes too long here"
     F, found = robust.plain(Z[:, :2], Z[:, 2:])
     mask = np.zeros(len(X), dtype=bool)
     if found is not None:
-        mask[finite] = found.ravel() != 0
+        mask[heard] = found.ravel() != 0
     watch.lap("draws")
     name = method_name(robust)
     if F is None:
         reason += (
-            f"; {name} found no F in {len(Z)} finite matches: they may be too few or degenerate"
+            f"; {name} found no F in {n_finite} finite matches: they may be too few or degenerate"
         )
     return Estimate(
         F=F,
@@ -368,7 +384,9 @@ def estimate_fundamental(
             "row i of both must be one match"
         )
     trust = None if scores is None else check_scores(scores, len(first))
-    _check("threshold", threshold, Real, lambda v: 1e-12 < v < 1e6, "a number above 0, below 1e6")
+    _check(
+        "threshold", threshold, Real, lambda v: 1e-12 < v < 1e6, "a number above 1e-12, below 1e6"
+    )
     _check("confidence", confidence, Real, lambda v: 0 < v < 1, "a number inside (0, 1)")
     _check("max_iters", max_iters, Integral, lambda v: v >= 1, "an integer, at least 1")
     check_density(density, alpha, dc_percent)
@@ -409,6 +427,8 @@ def check_scores(scores: ArrayLike, n: int | None) -> NDArray[np.float64]:
 
 def _points(points: ArrayLike, name: str) -> NDArray[np.float64]:
     array = np.asarray(points, dtype=np.float64)
+    if array.shape == (0,):
+        array = array.reshape(0, 2)
     if array.ndim == 3 and 1 in array.shape[:2] and array.shape[2] == 2:
         array = array.reshape(-1, 2)
     if array.ndim != 2 or array.shape[1] != 2:
@@ -417,5 +437,5 @@ def _points(points: ArrayLike, name: str) -> NDArray[np.float64]:
 
 
 def _check(name: str, value: Any, kind: type, holds: Callable[[Any], bool], wanted: str) -> None:
-    if not isinstance(value, kind) or not holds(value):
+    if isinstance(value, bool) or not isinstance(value, kind) or not holds(value):
         raise ValueError(f"{name} is {value!r}; it must be {wanted}")

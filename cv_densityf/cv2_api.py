@@ -12,7 +12,7 @@ import numpy as np
 from cv2.typing import MatLike
 from numpy.typing import ArrayLike, NDArray
 
-from cv_densityf._engine import Robust, is_usac, original
+from cv_densityf._engine import Robust, cuts_graph, is_usac, original, without_graph_cut
 from cv_densityf._epipolar import inlier_mask
 from cv_densityf._estimate import (
     LOG,
@@ -273,8 +273,10 @@ def find(
     slot = _mask_slot(call, n, usac)
     ordinary = n >= MIN_FILTERED and _is_ordinary(call)
     if density == "off" or not ordinary or slot is None:
-        if _OPENCV_5 and n > _GRAPH_CUT_MAX and _cuts_graph(call):
-            args, kwargs = _without_graph_cut(call), {}
+        if _OPENCV_5 and n > _GRAPH_CUT_MAX and cuts_graph(call.method, call.params):
+            method, params = without_graph_cut(call.method, call.params)
+            third = (method, *call[3:6]) if params is None else (params,)
+            args, kwargs = (*call[:2], *third, call.mask), {}
         try:
             answer = _cv2s_answer(call, n, usac, args, kwargs)
             return _passed_on(answer, n, density, start)
@@ -399,32 +401,17 @@ def _is_ordinary(call: Call) -> bool:
     )
 
 
-def _cuts_graph(call: Call) -> bool:
-    if call.params is not None:
-        return bool(call.params.loMethod == cv2.LOCAL_OPTIM_GC)
-    return call.method == cv2.USAC_ACCURATE
-
-
-def _without_graph_cut(call: Call) -> tuple[Any, ...]:
-    """Arguments of the same call with another local optimisation."""
-    if call.params is None:
-        return (*call[:2], cv2.USAC_DEFAULT, *call[3:6], call.mask)
-    params = cv2.UsacParams()
-    for name in dir(params):
-        if not name.startswith("_"):
-            setattr(params, name, getattr(call.params, name))
-    params.loMethod = cv2.LOCAL_OPTIM_INNER_AND_ITER_LO
-    return (*call[:2], params, call.mask)
-
-
 def _cv2s_answer(
     call: Call, n: int | None, usac: bool, args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> Any:
-    """Make cv2's own call, and put zeros where it answers with uninitialised memory."""
+    """Make cv2's own call, and put zeros where no model leaves old or uninitialised memory."""
     F, mask = original(*args, **kwargs)
-    if F is not None or mask is None or usac or call.method == cv2.FM_8POINT:
+    flagged = usac and call.params is None
+    if F is not None or mask is None or flagged or call.method == cv2.FM_8POINT:
         return F, mask
     garbage = mask.get() if isinstance(mask, cv2.UMat) else mask
+    if call.params is not None and (garbage.dtype != np.uint8 or garbage.size != n):
+        return F, mask  # not a mask to cv2
     # Fewer than 7 points leave the mask alone; exactly 7 are all inliers to cv2.
     if (garbage.size if n is None else n) > 7:
         if isinstance(mask, cv2.UMat):
@@ -447,8 +434,8 @@ def _is_solver_failure(error: cv2.error, call: Call, n: int, usac: bool) -> bool
 def _no_model(call: Call, n: int, usac: bool, slot: _MaskSlot) -> tuple[None, Any]:
     """Give cv2's answer for "no model found"."""
     if call.params is not None:
-        if isinstance(call.mask, np.ndarray):
-            call.mask[...] = 0
+        if slot.given is not None:
+            slot.given[...] = 0
         return None, call.mask
     # cv2's direct solvers count every point as an inlier, model or not.
     direct = not usac and (n == 7 or call.method == cv2.FM_8POINT)

@@ -10,7 +10,18 @@ import numpy as np
 import pytest
 
 from cv_densityf import _engine
-from cv_densityf._engine import METHODS, Robust, draw, is_usac, method_flag, method_name, original
+from cv_densityf._engine import (
+    GRAPH_CUT_MAX,
+    METHODS,
+    Robust,
+    cuts_graph,
+    draw,
+    is_usac,
+    method_flag,
+    method_name,
+    original,
+    without_graph_cut,
+)
 from cv_densityf._epipolar import sampson_distance
 from cv_densityf.datasets import two_view_scene
 
@@ -144,30 +155,35 @@ def graph_cut():
 
 
 @pytest.mark.parametrize("params", [None, graph_cut()], ids=["flag", "params"])
-def test_graph_cut_is_replaced_above_its_bound_only(params, monkeypatch):
-    """Calls are recorded: 300 rows cut graphs, 301 do not, whatever cv2 answers."""
-    calls = []
-    monkeypatch.setattr(_engine, "original", lambda *a: calls.append(a[2:]) or (None, None))
-    monkeypatch.setattr(_engine, "GRAPH_CUT_MAX", 300)
-    flag = cv2.USAC_ACCURATE if params is None else cv2.FM_RANSAC
-    robust = Robust(flag, 1.0, 0.99, 100, params)
-    for n in (300, 301):
-        robust.plain(np.zeros((n, 2)), np.zeros((n, 2)))
-    asked = (params,) if params is not None else (cv2.USAC_ACCURATE, 1.0, 0.99, 100)
-    assert calls[0] == asked
-    assert calls[1] == (cv2.USAC_DEFAULT, 1.0, 0.99, 100)
+def test_graph_cut_is_replaced_above_its_bound_only(params):
+    asked = Robust(cv2.USAC_ACCURATE if params is None else 0, 1.0, 0.99, 100, params)
+    assert asked.for_size(GRAPH_CUT_MAX) is asked
+    other = asked.for_size(GRAPH_CUT_MAX + 1)
+    assert not cuts_graph(other.flag, other.params)
+    assert (other.threshold, other.confidence, other.max_iters) == (1.0, 0.99, 100)
+
+
+def test_params_without_graph_cut_keep_all_else():
+    params = graph_cut()
+    params.threshold, params.sampler, params.randomGeneratorState = 2.5, cv2.SAMPLING_PROSAC, 77
+    _, other = without_graph_cut(0, params)
+    assert other.loMethod == cv2.LOCAL_OPTIM_INNER_AND_ITER_LO
+    assert params.loMethod == cv2.LOCAL_OPTIM_GC
+    names = [name for name in dir(params) if not name.startswith("_") and name != "loMethod"]
+    assert len(names) > 10
+    assert all(getattr(other, name) == getattr(params, name) for name in names)
 
 
 @pytest.mark.parametrize("name", ["usac_magsac", "ransac", "usac_default"])
-def test_methods_without_graph_cut_are_never_replaced(name, monkeypatch, scene):
-    monkeypatch.setattr(_engine, "GRAPH_CUT_MAX", 10)
-    answer = Robust(METHODS[name], 1.0, 0.99, 100).plain(scene.points1, scene.points2)
-    assert_same(answer, original(scene.points1, scene.points2, METHODS[name], 1.0, 0.99, 100))
+def test_methods_without_graph_cut_are_never_replaced(name):
+    asked = Robust(METHODS[name], 1.0, 0.99, 100)
+    assert asked.for_size(10 * GRAPH_CUT_MAX) is asked
 
 
 def test_accurate_answers_on_very_many_matches():
     big = two_view_scene(50_500, inlier_ratio=0.8, noise=0.5, random_state=0)
-    F, mask = Robust(cv2.USAC_ACCURATE, 1.5, 0.99, 100).plain(big.points1, big.points2)
+    asked = Robust(cv2.USAC_ACCURATE, 1.5, 0.99, 100).for_size(50_500)
+    F, mask = asked.plain(big.points1, big.points2)
     assert F is not None
     assert mask.ravel()[big.inliers].mean() > 0.5
 
