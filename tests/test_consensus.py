@@ -557,10 +557,10 @@ def test_finalists_are_the_best_three_of_different_inliers(seed, monkeypatch):
 def test_agreement_is_of_inliers_from_parts_of_other_sizes(common, more, sizes, agree):
     """Of two sets of 100 and of ``common`` and ``more``, by what they share of their union."""
     X = scene_of(0, n=300).X
-    pool = _Pool(X, np.ones(300), np.arange(300), 2.0, np.random.default_rng(0))
-    residuals = np.full((2, 300), 2.1)
-    residuals[0, :100] = 1.9
-    residuals[1, 100 - common : 100 + more] = 1.9
+    pool = _Pool(X, np.ones(300), np.arange(300), 3.0, np.random.default_rng(0))
+    residuals = np.full((2, 300), 3.1)
+    residuals[0, :100] = 2.9
+    residuals[1, 100 - common : 100 + more] = 2.9
     pool._append(np.zeros((2, 3, 3)), residuals**2, np.array([2.0, 1.0]), sizes)
     assert pool.agrees() == agree
 
