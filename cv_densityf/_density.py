@@ -85,8 +85,10 @@ class DensityPeaksResult:
                 raise ValueError(f"alpha is a share of the largest gamma, in [0, 1]; got {alpha}")
             chosen = self.gamma >= alpha * (self.rho.max() * self.delta.max())
             return np.asarray(order[chosen[order]])
-        if n is None or not 1 <= n <= len(order):
-            raise ValueError(f"n must lie between 1 and the {len(order)} points; got {n}")
+        if not (isinstance(n, Integral) and 1 <= n <= len(order)):
+            raise ValueError(
+                f"n must be a whole number between 1 and the {len(order)} points; got {n!r}"
+            )
         return np.asarray(order[:n])
 
     def labels(self, centers: ArrayLike) -> Ints:
@@ -106,11 +108,13 @@ class DensityPeaksResult:
         Raises
         ------
         ValueError
-            If a centre is not a row of the points or is given twice.
+            If a centre is not the number of a row of the points or is given twice.
         """
-        rows = np.asarray(centers, dtype=np.intp).ravel()
-        n = len(self.rho)
-        if rows.size and (rows.min() < 0 or rows.max() >= n or len(np.unique(rows)) < len(rows)):
+        rows, n = np.asarray(centers).ravel(), len(self.rho)
+        if not rows.size:
+            rows = rows.astype(np.intp)
+        whole = rows.dtype.kind in "iu"
+        if not whole or len(np.unique(rows[(rows >= 0) & (rows < n)])) < len(rows):
             raise ValueError(f"centers must be different row numbers between 0 and {n - 1}")
         root = np.flatnonzero(self.predecessor < 0)
         parent = self.predecessor.copy()

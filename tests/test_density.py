@@ -325,15 +325,17 @@ def test_the_largest_alpha_leaves_the_densest():
     assert peaks.centers(alpha=1).tolist() == [1]
 
 
-@pytest.mark.parametrize("options", [{}, {"alpha": 0.1, "n": 2}, {"alpha": 1.1}, {"n": 0}])
+@pytest.mark.parametrize(
+    "options", [{}, {"alpha": 0.1, "n": 2}, {"alpha": 1.1}, {"n": 0}, {"n": 6}, {"n": 2.5}]
+)
 def test_centers_wants_one_rule_in_range(options):
-    with pytest.raises(ValueError, match=r"alpha|n must lie"):
+    with pytest.raises(ValueError, match=r"alpha|n must be a whole number between 1 and the 5"):
         density_peaks(np.eye(5)).centers(**options)
 
 
 def test_labels_and_halo_refuse_what_does_not_fit():
     peaks = density_peaks(np.eye(5))
-    for centers in ([5], [-1], [1, 1], [0, 5], [4, -1]):
+    for centers in ([5], [-1], [1, 1], [0, 5], [4, -1], [0.7], [1.0], [True], ["1"], [2**63]):
         with pytest.raises(ValueError, match="row numbers"):
             peaks.labels(centers)
     with pytest.raises(ValueError, match="shape"):
