@@ -15,6 +15,8 @@ import numpy as np
 from numpy.lib.format import MAGIC_PREFIX
 from numpy.typing import NDArray
 
+from cv_densityf._estimate import check_scores
+
 #: No file is read that holds more matches: memory would not bear what follows either.
 MAX_MATCHES = 10_000_000
 #: Bytes of that many points in the widest numbers there are.
@@ -46,7 +48,8 @@ def read_matches(
     ----------
     path : str or path-like
         ``.npz``: arrays ``points1`` and ``points2`` (or ``pts1`` and ``pts2``), each (n, 2) in
-        pixels, and optionally ``scores`` (or ``score``), (n,); pickled objects are refused.
+        pixels, and optionally ``scores`` (or ``score``), (n,) or (n, 1); pickled objects are
+        refused.
         ``.csv``: comma-separated columns x, y, x', y' and optionally a score; one header row is
         allowed. Up to ten million matches are read.
 
@@ -70,12 +73,21 @@ def read_matches(
         raise InputError(f"{path}: matches are read from a .npz or a .csv file")
     try:
         X, scores = _read_npz(path) if suffix == ".npz" else _read_csv(path)
+        if scores is not None:
+            scores = _checked(scores, len(X))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    if scores is not None and np.isnan(scores).any():
-        row = int(np.flatnonzero(np.isnan(scores))[0]) + 1
-        raise InputError(f"{path}: the score of match {row} is NaN; give a low score instead")
     return np.ascontiguousarray(X, dtype=np.float64), scores
+
+
+def _checked(scores: NDArray[np.float64], n: int) -> NDArray[np.float64]:
+    nan = np.flatnonzero(np.isnan(scores))
+    if nan.size:
+        raise InputError(f"the score of match {nan[0] + 1} is NaN; give a low score instead")
+    try:
+        return check_scores(scores, n)
+    except ValueError as error:
+        raise InputError(str(error)) from None
 
 
 def _read_npz(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
@@ -97,8 +109,6 @@ def _read_npz(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | No
             raise InputError(f"{name} must have the shape (n, 2), not {points.shape}")
     if len(points1) != len(points2):
         raise InputError(f"{len(points1)} points in {names[0]}, {len(points2)} in {names[1]}")
-    if scores is not None and scores.shape != (len(points1),):
-        raise InputError(f"{score_key} must have the shape ({len(points1)},), not {scores.shape}")
     return np.hstack([points1, points2]), scores
 
 

@@ -56,6 +56,12 @@ class TestNpz:
         else:
             np.testing.assert_array_equal(scores, SCORES)
 
+    @pytest.mark.parametrize("shape", [(12, 1), (1, 12)])
+    def test_scores_in_a_column_or_a_row(self, tmp_path, shape):
+        path, scores = tmp_path / "matches.npz", np.where(SCORES > 0.8, np.inf, SCORES)
+        np.savez(path, points1=X[:, :2], points2=X[:, 2:], scores=scores.reshape(shape))
+        np.testing.assert_array_equal(read_matches(path)[1], scores)
+
     @pytest.mark.parametrize("dtype", [np.float32, np.int16, np.float16])
     def test_any_real_numbers(self, tmp_path, dtype):
         path = tmp_path / "matches.npz"
@@ -74,7 +80,11 @@ class TestNpz:
             ({"points1": X[:, :2], "points2": X[:5, 2:]}, "12 points in points1, 5 in points2"),
             (
                 {"points1": X[:, :2], "points2": X[:, 2:], "scores": SCORES[:5]},
-                r"scores must have the shape \(12,\), not \(5,\)",
+                "scores has 5 entries for 12 matches",
+            ),
+            (
+                {"points1": X[:, :2], "points2": X[:, 2:], "scores": X[:6, :2]},
+                r"scores has shape \(6, 2\)",
             ),
             ({"points1": X[:, :2].astype(str), "points2": X[:, 2:]}, "points1 must hold real"),
             ({"points1": X[:, :2] * 1j, "points2": X[:, 2:]}, "points1 must hold real"),
