@@ -330,7 +330,7 @@ def _run_match(options: argparse.Namespace) -> int:
         with _stage("matching", timings):
             matches = match_features(*features, ratio=options.ratio)
         X, scores = matches.X, matches.scores
-    n_finite = int(np.isfinite(X).all(axis=1).sum())
+    n_finite = int(finite_in_cv2(X).sum())
     if n_finite < _MIN_MATCHES:
         count = f"{n_finite} matches" if n_finite == len(X) else f"{n_finite} finite matches"
         raise InputError(

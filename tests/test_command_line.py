@@ -263,6 +263,11 @@ class TestNoF:
         (["match", "--points", "{here}/text.csv"], "text.csv: header 'hello' is not"),
         (["match", "--points", "{here}/seven.csv"], "seven.csv: 7 matches, .* at least 8"),
         (["match", "--points", "{here}/nan.csv"], "nan.csv: 7 finite matches, .* at least 8"),
+        # More than cv2's float32 holds; of seven matches its RANSAC finds up to three matrices.
+        (
+            ["match", "--points", "{here}/far.csv", "--method", "ransac", "--plot", "{here}/p.png"],
+            "far.csv: 7 finite matches, .* at least 8",
+        ),
         (["match", "--points", "{npz}", "a.png", "b.png"], "--points and images exclude"),
         (["match", "--points", "{npz}", "--ratio", "0.8"], "--points and --ratio exclude"),
         (["match", "--points", "{npz}", "--max-size", "9"], "--points and --max-size exclude"),
@@ -290,6 +295,7 @@ def test_wrong_use(run, npz, tmp_path, arguments, message):
         np.pad(SCENE.X[:7], ((0, 3), (0, 0)), constant_values=np.nan),
         delimiter=",",
     )
+    np.savetxt(tmp_path / "far.csv", np.vstack([SCENE.X[:7], [1e300, 0, 0, 0]]), delimiter=",")
     cv2.imwrite(str(tmp_path / "black.png"), np.zeros((50, 60), np.uint8))
     before = {path.name for path in tmp_path.iterdir()}
     code, out, err = run(*(text.format(here=tmp_path, npz=npz) for text in arguments))
