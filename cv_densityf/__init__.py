@@ -11,6 +11,7 @@ from cv_densityf._zhang import epipolar_distance
 from cv_densityf.cv2_api import findFundamentalMat
 
 if TYPE_CHECKING:
+    from cv_densityf._files import InputError
     from cv_densityf.batch import estimate_many
     from cv_densityf.estimators import (
         DecisionGraphDisplay,
@@ -29,6 +30,7 @@ _LAZY = {
     "DensityPeaks": "estimators",
     "DensityPeaksFilter": "estimators",
     "FundamentalMatrixEstimator": "estimators",
+    "InputError": "_files",
     "Matches": "matching",
     "estimate_many": "batch",
     "is_patched": "patching",
@@ -46,6 +48,7 @@ __all__ = [
     "DensityPeaksResult",
     "Estimate",
     "FundamentalMatrixEstimator",
+    "InputError",
     "Matches",
     "density_peaks",
     "epipolar_distance",

@@ -36,7 +36,11 @@ _HEADERS = (
 
 
 class InputError(ValueError):
-    """A file that is not what it should be; the message is one line and says what to do."""
+    """A file that is not what it should be; the message is one line and says what to do.
+
+    `cv_densityf.read_image` and `cv_densityf.colmap.verify_matches` raise it, as does the command
+    line, which prints the message and ends with 2.
+    """
 
 
 def read_matches(

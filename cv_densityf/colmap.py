@@ -107,9 +107,9 @@ def verify_matches(
 
     Raises
     ------
-    InputError
-        If the file is not a COLMAP database with matches, is damaged, locked or cannot be written.
-        Before anything is written, unless the trouble begins later.
+    cv_densityf.InputError
+        A ``ValueError``: the file is not a COLMAP database with matches, is damaged, locked or
+        cannot be written. Before anything is written, unless the trouble begins later.
     OSError
         If there is no such file.
     TypeError, ValueError

@@ -89,7 +89,7 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[Any]:
     ------
     OSError
         If the file cannot be read.
-    InputError
+    cv_densityf.InputError
         A ``ValueError``: OpenCV cannot decode the file.
     """
     # Read whole, this would only be refused by OpenCV.

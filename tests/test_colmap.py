@@ -14,9 +14,8 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from cv_densityf import estimate_fundamental
+from cv_densityf import InputError, estimate_fundamental
 from cv_densityf.__main__ import main
-from cv_densityf._files import InputError
 from cv_densityf.colmap import DEGENERATE, UNCALIBRATED, _open, verify_matches
 from cv_densityf.datasets import two_view_scene
 

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from cv_densityf import matching
+from cv_densityf import InputError, matching
 from cv_densityf._epipolar import sampson_distance
-from cv_densityf._files import InputError
 from cv_densityf.datasets import motorcycle
 from cv_densityf.matching import Features, detect, match_features, match_images, read_image
 
