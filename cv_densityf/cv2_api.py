@@ -410,8 +410,6 @@ def _cv2s_answer(
     if F is not None or mask is None or flagged or call.method == cv2.FM_8POINT:
         return F, mask
     garbage = mask.get() if isinstance(mask, cv2.UMat) else mask
-    if call.params is not None and (garbage.dtype != np.uint8 or garbage.size != n):
-        return F, mask  # not a mask to cv2
     # Fewer than 7 points leave the mask alone; exactly 7 are all inliers to cv2.
     if (garbage.size if n is None else n) > 7:
         if isinstance(mask, cv2.UMat):
@@ -434,8 +432,8 @@ def _is_solver_failure(error: cv2.error, call: Call, n: int, usac: bool) -> bool
 def _no_model(call: Call, n: int, usac: bool, slot: _MaskSlot) -> tuple[None, Any]:
     """Give cv2's answer for "no model found"."""
     if call.params is not None:
-        if slot.given is not None:
-            slot.given[...] = 0
+        if isinstance(call.mask, np.ndarray):
+            call.mask[...] = 0  # of any kind, since it is what comes back
         return None, call.mask
     # cv2's direct solvers count every point as an inlier, model or not.
     direct = not usac and (n == 7 or call.method == cv2.FM_8POINT)
