@@ -82,24 +82,30 @@ def estimate_many(
         raise TypeError("scores belong to a pair: give (points1, points2, scores)")
     # Checks the options now, not in each worker.
     estimate_fundamental(np.empty((0, 2)), np.empty((0, 2)), **options)
+    run = _runner(n_jobs, backend)
     total = len(pairs) if isinstance(pairs, Sized) else None
-    estimates = _estimates(iter(pairs), n_jobs, backend, options)
+    estimates = _estimates(iter(pairs), run, n_jobs, backend, options)
     return _with_progress(estimates, total, progress)
 
 
 def _estimates(
-    pairs: Iterator[Pair], n_jobs: int | None, backend: str | None, options: dict[str, Any]
+    pairs: Iterator[Pair],
+    run: Any,
+    n_jobs: int | None,
+    backend: str | None,
+    options: dict[str, Any],
 ) -> Iterator[Estimate]:
     source = _Source(pairs)
     while not source.empty:
         try:
-            for estimate in _parallel(source, n_jobs, backend, options):
+            for estimate in _answers(run, source, options):
                 source.pending.popleft()
                 yield estimate
         except BrokenExecutor:
             # Any of the unfinished pairs may be the one to blame.
             while source.pending:
                 yield _alone(source.pending.popleft(), options)
+            run = _runner(n_jobs, backend)
         if source.error is not None:
             raise source.error
 
@@ -124,16 +130,23 @@ class _Source:
         self.empty = True
 
 
-def _parallel(
-    pairs: Iterable[Pair], n_jobs: int | None, backend: str | None, options: dict[str, Any]
-) -> Iterator[Estimate]:
-    from joblib import Parallel, delayed
+def _runner(n_jobs: int | None, backend: str | None) -> Any:
+    """Make joblib's ``Parallel``, or raise what it says of its options."""
+    from joblib import Parallel
 
+    if n_jobs == 0:  # which joblib would find out with the first pair
+        raise ValueError("n_jobs is 0; it must be a number of pairs at a time, or -1 for all cores")
     run = Parallel(n_jobs=n_jobs, backend=backend, return_as="generator")
     # Whoever takes the first results and leaves knows what is lost.
     run._warn_exit_early = lambda: None
     if type(run._backend).__name__ == "DaskDistributedBackend":
         run._backend = _with_losses_told(run._backend)
+    return run
+
+
+def _answers(run: Any, pairs: Iterable[Pair], options: dict[str, Any]) -> Iterator[Estimate]:
+    from joblib import delayed
+
     estimates: Iterator[Estimate] = run(delayed(_one)(pair, options) for pair in pairs)
     return estimates
 
@@ -188,7 +201,7 @@ def _alone(pair: Pair, options: dict[str, Any]) -> Estimate:
     """Estimate one pair in a process of its own, on this machine."""
     try:
         # One job would not leave this process.
-        (estimate,) = _parallel([pair], 2, "loky", options)
+        (estimate,) = _answers(_runner(2, "loky"), [pair], options)
     except BrokenExecutor as error:
         return _failure(
             pair,

@@ -121,6 +121,23 @@ def test_wrong_options_are_refused_at_once():
         estimate_many(never(), method="magic")
     with pytest.raises(TypeError, match="treshold"):
         estimate_many(never(), treshold=1)
+    for wrong in ({"n_jobs": 0}, {"n_jobs": "two"}, {"backend": "nonsense"}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            estimate_many(never(), **wrong)
+
+
+def test_joblib_s_settings_are_those_of_the_call(pairs):
+    names = set()
+
+    class Named:
+        def __array__(self, dtype=None, copy=None):
+            names.add(threading.current_thread().name)
+            return pairs[0][0]
+
+    with joblib.parallel_config(backend="threading", n_jobs=2):
+        estimates = estimate_many([(Named(), pairs[0][1])] * 3)
+    assert all(estimates)
+    assert threading.current_thread().name not in names
 
 
 @pytest.mark.parametrize("n_jobs", [1, 2])
