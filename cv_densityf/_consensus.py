@@ -64,6 +64,7 @@ _NARROWEST = 0.1
 _FINALISTS = 3
 #: The winner has a way to go from where the part left it: in strides of this many steps of the
 #: polish, for wrong matches make them short, at a width of this many robust standard deviations.
+#: So long strides need not converge; more of them would not be better.
 _STRIDES = 10
 _STRIDE = 3.0
 _STRIDE_SIGMAS = 1.4
@@ -270,7 +271,7 @@ class _Pool:
         if size < 8:
             return
         keys = self._rng.random((_LOCAL_SAMPLES, len(near)))
-        F = eight_point(self._X[near[keys.argpartition(size - 1, axis=1)[:, :size]]])
+        F = eight_point(self._X[near[keys.argpartition(size, axis=1)[:, :size]]])
         F = F[np.isfinite(F).all(axis=(1, 2))]  # nothing fits the copies of one match
         if not len(F):
             return
@@ -320,7 +321,6 @@ class _Pool:
         step = G
         for _ in range(_STRIDES):
             step = polish(self._frame, G, [width])
-            step *= np.sign(np.sum(step * G))
             G = G + _STRIDE * (step - G)
         return _refined(self._frame, step[0], self._reliable, self.threshold)
 
@@ -337,7 +337,7 @@ def _noise(squared: Floats, threshold: float) -> float:
     """Robust standard deviation of the inliers' residuals, pixels.
 
     1.4826 times the median of the residuals below the threshold, then of those below 2.5 of these
-    standard deviations, until it settles.
+    standard deviations, four times, by when it has settled.
     """
     r = np.sqrt(np.sort(squared))
     cut, sigma = threshold, 0.4 * threshold

@@ -71,7 +71,7 @@ class Estimate:
         Milliseconds per stage.
     votes : tuple of float
         The vote for each polished hypothesis, in the order of the draws; where no two draws agree,
-        then for those of the local optimisation.
+        then for those of the local optimisation. Of many matches, those of the part that searched.
 
     See Also
     --------
