@@ -739,7 +739,7 @@ def _plain_estimate(
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.bool_]]:
     """Call cv2 on the candidates, and on all rows where that fails; F and the rows it is from."""
     drawn = matches[candidates]
-    F, _ = robust.plain(drawn[:, :2], drawn[:, 2:])
+    F, _ = robust.for_size(len(drawn)).plain(drawn[:, :2], drawn[:, 2:])
     if F is None and not candidates.all():
         warnings.warn(
             f"no fundamental matrix from the {len(drawn)} rows that the prefilter kept: all "

@@ -25,7 +25,7 @@ from sklearn.preprocessing import FunctionTransformer
 from sklearn.utils.estimator_checks import estimator_checks_generator, parametrize_with_checks
 from sklearn.utils.validation import validate_data
 
-from cv_densityf import estimators
+from cv_densityf import _engine, estimators
 from cv_densityf._density import density_peaks
 from cv_densityf._engine import METHODS
 from cv_densityf._estimate import estimate_fundamental
@@ -126,6 +126,17 @@ def test_without_prefilter_it_is_cv2(scene, method, n):
     np.testing.assert_array_equal(estimator.predict(X), estimator.inlier_mask_)
     assert estimator.n_inliers_ == estimator.inlier_mask_.sum()
     assert estimator.candidate_mask_.all()
+
+
+def test_graph_cut_gets_no_more_rows_than_it_bears(scene, monkeypatch):
+    monkeypatch.setattr(_engine, "GRAPH_CUT_MAX", len(scene.X) - 1)
+    estimator = FundamentalMatrixEstimator(None, method="usac_accurate").fit(scene.X)
+    settings = (1.0, 0.999, 5000)
+    points = scene.points1, scene.points2
+    expected, _ = cv2.findFundamentalMat(*points, cv2.USAC_DEFAULT, *settings)
+    np.testing.assert_array_equal(estimator.F_, expected)
+    by_graph_cut, _ = cv2.findFundamentalMat(*points, cv2.USAC_ACCURATE, *settings)
+    assert not np.array_equal(by_graph_cut, expected)
 
 
 @pytest.mark.parametrize("method", ["usac_accurate", "ransac", cv2.USAC_MAGSAC, "lmeds"])
