@@ -200,7 +200,11 @@ def _filtered(
 
 
 def _polished(estimate: Estimator) -> Estimator:
-    """Refine what another estimator found on all matches, as ours refines its candidates."""
+    """Refine on all matches what another estimator found.
+
+    The steps are those of ours, but more of them, at one width, which follows from the caller's
+    threshold.
+    """
 
     def estimate_and_polish(pair: Pair, s: Settings) -> Floats | None:
         F = estimate(pair, s)
