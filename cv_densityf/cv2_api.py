@@ -222,7 +222,8 @@ def findFundamentalMat(
     result, and the mask is over all.
 
     Deliberate differences from cv2: where ``FM_RANSAC`` and ``FM_LMEDS`` find no model cv2 returns
-    uninitialised memory as the mask and leaves a given ``mask`` as it was; here both are zeros.
+    uninitialised memory as the mask; there, and with ``cv2.UsacParams``, it leaves a given ``mask``
+    as it was. Here both are zeros.
     Where cv2's solver raises on valid points, or would take the process down (graph cut on more
     than 46,340 points in OpenCV 5.0), this function goes on with another engine and answers
     ``None`` only when that finds no model either.
