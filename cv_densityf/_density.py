@@ -242,7 +242,7 @@ def density_peaks(
     >>> np.bincount(peaks.labels(centers))
     array([40, 60])
     """
-    X = _checked_points(X)
+    X = checked_points(X)
     if dc is not None and not 0 < dc < math.inf:
         raise ValueError(f"dc is a distance, finite and greater than 0; got {dc}")
     if not 0 < dc_percent <= 100:
@@ -279,7 +279,8 @@ def density_peaks(
     return DensityPeaksResult(rho, delta, rho * delta, float(dc), predecessor, X)
 
 
-def _checked_points(X: ArrayLike) -> Floats:
+def checked_points(X: ArrayLike) -> Floats:
+    """Return points (n, d) in float64, or raise ValueError where their distances are no numbers."""
     points = np.ascontiguousarray(X, dtype=np.float64)
     if points.ndim != 2 or 0 in points.shape:
         raise ValueError(

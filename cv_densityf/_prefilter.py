@@ -31,8 +31,8 @@ def density_contrast(X: Floats, n_neighbors: int | None = None) -> NDArray[np.fl
     ----------
     X : array, shape (n, 4)
         Finite matches x, y, x', y', n >= 2.
-    n_neighbors : int
-        Largest neighbourhood.
+    n_neighbors : int, optional
+        Largest neighbourhood, `N_NEIGHBORS` by default.
 
     Returns
     -------

@@ -29,7 +29,7 @@ from sklearn.utils.validation import (
 )
 
 from cv_densityf import _epipolar
-from cv_densityf._density import density_peaks
+from cv_densityf._density import checked_points, density_peaks
 from cv_densityf._display import DecisionGraphDisplay
 from cv_densityf._engine import METHODS, Robust, method_flag
 from cv_densityf._estimate import MIN_FILTERED, run
@@ -331,7 +331,7 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
         if n < MIN_FILTERED:
             reliability, support = np.ones(n), np.ones(n, dtype=bool)
         elif self.rule == "contrast":
-            reliability, support = contrast_support(matches)
+            reliability, support = contrast_support(checked_points(matches))
         else:
             reliability, support = paper_support(matches, self.alpha, self.dc_percent)
         if weight is not None:

@@ -546,3 +546,10 @@ def test_decision_graph_display(scene):
 def test_importing_the_package_imports_no_scikit_learn():
     code = "import sys, cv_densityf; assert not {'sklearn', 'matplotlib'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("rule", ["contrast", "paper"])
+def test_points_whose_distances_overflow_are_refused(rule):
+    X = two_view_scene(50, random_state=0).X * 1e160
+    with pytest.raises(ValueError, match="rescale"):
+        DensityPeaksFilter(rule=rule).fit(X)
