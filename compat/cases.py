@@ -609,6 +609,7 @@ def _masks(n: int) -> dict[str, Callable[[], Any]]:
         "bool": lambda: np.ones((n, 1), bool),
         "read-only": lambda: _read_only(filled((n, 1))),
         "UMat": lambda: cv2.UMat(filled((n, 1))),
+        "empty UMat": lambda: cv2.UMat(),
         "list": lambda: [0] * n,
         "str": lambda: "mask",
         "object array": lambda: filled((n, 1)).astype(object),

@@ -411,8 +411,9 @@ def _cv2s_answer(
     if F is not None or mask is None or flagged or call.method == cv2.FM_8POINT:
         return F, mask
     garbage = mask.get() if isinstance(mask, cv2.UMat) else mask
-    # Fewer than 7 points leave the mask alone; exactly 7 are all inliers to cv2.
-    if (garbage.size if n is None else n) > 7:
+    # Fewer than 7 points leave the mask alone; exactly 7 are all inliers to cv2. An empty UMat
+    # gets no array.
+    if garbage is not None and (garbage.size if n is None else n) > 7:
         if isinstance(mask, cv2.UMat):
             no_mask: Any = None
             cv2.copyTo(as_umat(np.zeros_like(garbage)), no_mask, mask)
