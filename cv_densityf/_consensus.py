@@ -97,6 +97,7 @@ def search(
     max_iters: int,
     seed: int,
     watch: Stopwatch,
+    about: tuple[Floats, float] | None = None,
     scores: Floats | None = None,
     others: Floats | None = None,
 ) -> Consensus | None:
@@ -122,6 +123,8 @@ def search(
         Where the draws' random numbers start.
     watch : Stopwatch
         Is charged with the time of draws, polish and vote.
+    about : (array, float), optional
+        What `middle` says of X, if it is known.
     scores : array, shape (n,), optional
         The caller's trust in each match: one more draw takes its samples in this order, whatever
         the density says.
@@ -136,12 +139,14 @@ def search(
     """
     n = len(X)
     # Far from the origin the float32 that cv2 draws with would eat the pixels.
-    centre, _ = middle(X)
+    centre, spread = about or middle(X)
     X = X - centre
     order = np.argsort(-reliability, kind="stable")
     points = X[order].astype(np.float32)
     reliable = order[: max(MIN_DRAW, n // 2)]
-    pool = _Pool(X, reliability, reliable, threshold, np.random.default_rng(abs(seed)))
+    frame = Frame(X, (np.zeros(4), spread))
+    rng = np.random.default_rng(abs(seed))
+    pool = _Pool(X, reliability, reliable, threshold, rng, frame)
     n_draws = 0
     found, sizes = [], []
     if scores is not None:
@@ -175,17 +180,19 @@ def search(
                 pool.adapt()
             found, sizes = [], []
         watch.lap("polish")
-        if pool.agrees():
+        agreed = pool.agrees()
+        if agreed:
             break
     else:
         if len(pool) == 0:
             return None
         for _ in range(_LOCAL_ROUNDS):
             pool.optimise()
+        agreed = pool.agrees()
     F = pool.refined_best() if others is None else pool.before(others - centre).settled_best()
     F = shift(-centre[2:]).T @ F @ shift(-centre[:2])
     watch.lap("polish")
-    again = ", found again by another" if pool.agrees() else ""
+    again = ", found again by another" if agreed else ""
     reason = f"the hypothesis with the most votes of {n_draws} draws{again}"
     return Consensus(F=F, votes=tuple(pool.votes.tolist()), n_draws=n_draws, reason=reason)
 
@@ -204,6 +211,7 @@ class _Pool:
         reliable: Ints,
         threshold: float,
         rng: np.random.Generator,
+        frame: Frame | None = None,
     ) -> None:
         self.threshold = threshold
         self.working = threshold
@@ -211,7 +219,7 @@ class _Pool:
         self._X = X
         self._reliable = reliable
         self._rng = rng
-        self._frame = Frame(X)
+        self._frame = frame or Frame(X)
         # What lies far out must not make the cells so large that all others share one.
         reach = FAR / self._frame.scale
         self._ballot = _Ballot(X.clip(-reach, reach), reliability)

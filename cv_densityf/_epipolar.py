@@ -102,13 +102,16 @@ class Frame:
 
     Both images are centred and divided by the *same* scale, so that a residual in this frame is a
     residual in pixels times ``scale``. Hartley, "In defense of the eight-point algorithm" (1997);
-    here without what lies far out.
+    here without what lies far out, or ``about`` a given centroid and standard deviation.
     """
 
-    __slots__ = ("_first", "_second", "homogeneous1", "homogeneous2", "outer", "products", "scale")
+    __slots__ = (
+        *("_first", "_from_first", "_from_second", "_second"),
+        *("homogeneous1", "homogeneous2", "outer", "products", "scale"),
+    )
 
-    def __init__(self, X: Floats) -> None:
-        centre, spread = middle(X)
+    def __init__(self, X: Floats, about: tuple[Floats, float] | None = None) -> None:
+        centre, spread = about or middle(X)
         self.scale = 1.0 / spread if spread > 0 else 1.0
         Z = (X - centre).T * self.scale
         ones = np.ones((1, len(X)))
@@ -123,6 +126,7 @@ class Frame:
         zoom = np.diag([self.scale, self.scale, 1.0])
         self._first = zoom @ shift(-centre[:2])
         self._second = zoom @ shift(-centre[2:])
+        self._from_first, self._from_second = np.linalg.inv([self._first, self._second])
 
     def part(self, rows: NDArray[np.bool_]) -> Frame:
         """Return the same frame, holding only the matches marked in ``rows`` (n,)."""
@@ -133,7 +137,7 @@ class Frame:
 
     def enter(self, F: Floats) -> Floats:
         """Fundamental matrices (m, 3, 3) in pixels, in this frame and of unit norm."""
-        G = np.linalg.inv(self._second).T @ F @ np.linalg.inv(self._first)
+        G = self._from_second.T @ F @ self._from_first
         return np.asarray(G / np.sqrt(np.einsum("mij,mij->m", G, G))[:, None, None])
 
     def leave(self, G: Floats) -> Floats:

@@ -152,7 +152,7 @@ def _estimate(
         heard = rows[_spread(X[rows], MAX_REFINED, rng)]
         rows = heard[_spread(X[heard], MAX_SEARCHED, rng)]
     Z = X[rows] if len(rows) < n else X
-    if _on_a_line(Z[:, :2]) or _on_a_line(Z[:, 2:]):
+    if _on_a_line(Z):
         return _plain(
             X,
             finite,
@@ -170,8 +170,9 @@ def _estimate(
     kept = np.zeros(n, dtype=bool)
     kept[rows] = support
     watch.lap("density")
+    about = middle(Z)
     asked: dict[str, Any] = {
-        "threshold": _search_threshold(Z, robust, density),
+        "threshold": _search_threshold(about[1], robust, density),
         "confidence": robust.confidence,
         "max_iters": robust.max_iters,
         "seed": seed,
@@ -189,7 +190,9 @@ def _estimate(
                     searched = np.zeros(n, dtype=bool)
                     searched[rows] = True
                     others = X[heard[~searched[heard]]]
-                found = search(Z, r, watch=watch, scores=trust, others=others, **asked)
+                found = search(
+                    Z, r, watch=watch, about=about, scores=trust, others=others, **asked
+                )
         except np.linalg.LinAlgError:
             found = None
     if found is None:
@@ -215,8 +218,8 @@ def _estimate(
     )
 
 
-def _search_threshold(X: NDArray[np.float64], robust: Robust, density: str) -> float:
-    own = _SEARCH_THRESHOLD * middle(X)[1]
+def _search_threshold(spread: float, robust: Robust, density: str) -> float:
+    own = _SEARCH_THRESHOLD * spread
     if robust.rule == "lmeds":  # takes none from the caller
         return own
     if density == "paper":  # th of its step 5
@@ -259,12 +262,17 @@ def finite_in_cv2(X: NDArray[np.floating]) -> NDArray[np.bool_]:
         return np.asarray(np.isfinite(X.astype(np.float32)).all(axis=1))
 
 
-def _on_a_line(points: NDArray[np.float64]) -> bool:
-    """Whether the points lie on one line, or on one spot, as far as float32 can tell."""
-    centred = points - points.mean(axis=0)
-    (a, b), (_, d) = centred.T @ centred / len(points)
-    smallest = 0.5 * (a + d - np.hypot(a - d, 2.0 * b))
-    return bool(smallest <= 1e-12 * np.square(points).max())
+def _on_a_line(X: NDArray[np.float64]) -> bool:
+    """Whether an image's points lie on one line, or on one spot, as far as float32 can tell."""
+    largest = np.abs(X).max(axis=0)
+    centred = X - X.mean(axis=0)
+    covariance = centred.T @ centred / len(X)
+    for image in (slice(0, 2), slice(2, 4)):
+        (a, b), (_, d) = covariance[image, image]
+        smallest = 0.5 * (a + d - np.hypot(a - d, 2.0 * b))
+        if smallest <= 1e-12 * largest[image].max() ** 2:
+            return True
+    return False
 
 
 def _plain(
