@@ -190,9 +190,7 @@ def _estimate(
                     searched = np.zeros(n, dtype=bool)
                     searched[rows] = True
                     others = X[heard[~searched[heard]]]
-                found = search(
-                    Z, r, watch=watch, about=about, scores=trust, others=others, **asked
-                )
+                found = search(Z, r, watch=watch, about=about, scores=trust, others=others, **asked)
         except np.linalg.LinAlgError:
             found = None
     if found is None:
