@@ -40,10 +40,9 @@ MAX_RANKED_ITERS = 5 * MAX_DRAW_ITERS
 _AGREEMENT = 0.93
 #: Draws from parts whose sizes differ by less than this factor are not independent.
 _DISTINCT = 1.4
-#: Rounds of the local optimisation, their samples and largest size of these, how many working
-#: thresholds from the best hypothesis they are taken, and how far their polish looks.
-_LOCAL_ROUNDS = 2
-_LOCAL_SAMPLES = 10
+#: Samples of the local optimisation and largest size of these, how many working thresholds from
+#: the best hypothesis they are taken, and how far their polish looks.
+_LOCAL_SAMPLES = 16
 _LOCAL_SIZE = 14
 _LOCAL_WIDTH = 3.0
 _LOCAL_REACH = 20.0
@@ -186,8 +185,7 @@ def search(
     else:
         if len(pool) == 0:
             return None
-        for _ in range(_LOCAL_ROUNDS):
-            pool.optimise()
+        pool.optimise()
         agreed = pool.agrees()
     F = pool.refined_best() if others is None else pool.before(others - centre).settled_best()
     F = shift(-centre[2:]).T @ F @ shift(-centre[:2])

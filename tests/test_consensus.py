@@ -461,7 +461,7 @@ def test_where_no_two_draws_agree_the_best_is_optimised(monkeypatch):
     assert len(find(X).votes) == find(X).n_draws
     monkeypatch.setattr(_Pool, "agrees", lambda pool: False)
     found = find(X)
-    assert len(found.votes) == found.n_draws + _consensus._LOCAL_ROUNDS
+    assert len(found.votes) == found.n_draws + 1
 
 
 def test_local_optimisation_is_no_second_opinion():
