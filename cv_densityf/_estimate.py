@@ -433,8 +433,8 @@ def check_scores(scores: ArrayLike, n: int | None) -> NDArray[np.float64]:
 
 def _points(points: ArrayLike, name: str) -> NDArray[np.float64]:
     array = np.asarray(points, dtype=np.float64)
-    if array.ndim == 1 and not array.size:
-        array = array.reshape(0, 2)
+    if array.shape == (0,):
+        return np.empty((0, 2))
     if array.ndim == 3 and 1 in array.shape[:2] and array.shape[2] == 2:
         array = array.reshape(-1, 2)
     if array.ndim != 2 or array.shape[1] != 2:

@@ -597,6 +597,8 @@ GOOD = np.zeros((20, 2))
         ({"method": 77}, "unknown method 77; choose one of"),
         ({"method": 8.0}, "unknown method 8.0; choose one of"),
         ({"method": None}, "unknown method None; choose one of"),
+        ({"method": True}, "unknown method True; choose one of"),
+        ({"threshold": True}, "threshold is True; it must be "),
         ({"scores": np.zeros(19)}, "scores has 19 entries for 20 matches"),
         ({"scores": np.full(20, np.nan)}, "scores has NaN; give .* the lowest score"),
     ],
@@ -731,3 +733,10 @@ def test_an_f_that_fits_next_to_nothing_is_not_ours():
     )
     assert estimate.engine == "usac_default"
     assert "too few matches fit" in estimate.reason
+
+
+def test_empty_lists_are_no_matches():
+    found = estimate_fundamental([], [])
+    assert not found
+    assert found.mask.shape == (0,)
+    assert "0 finite matches" in found.reason
