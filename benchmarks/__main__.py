@@ -217,10 +217,7 @@ def _stages(args: argparse.Namespace) -> int:
 
 
 def _scale(args: argparse.Namespace) -> int:
-    text = scale(args.n, args.cluster_n, args.scenes, args.scene, args.plot)
-    print(text)
-    if args.page:
-        report.fill(args.page, text)
+    _show(scale(args.n, args.cluster_n, args.scenes, args.scene, args.plot), args.page)
     return 0
 
 
@@ -228,9 +225,8 @@ def _paper(args: argparse.Namespace) -> int:
     with TemporaryDirectory() as scratch:
         folder = Path(args.out or scratch)
         text = reproduce(args.data, folder, args.seeds, args.quick)
-        print(text)
+        _show(text, args.page)
         if args.page:
-            report.fill(args.page, text)
             images = Path(args.page).parent / "images"
             images.mkdir(exist_ok=True)
             for picture in folder.glob("paper-*.png"):
@@ -243,9 +239,7 @@ def _reliability(args: argparse.Namespace) -> int:
     from benchmarks.reliability import reliability
 
     text = reliability(args.calls, args.seconds, args.repeats, args.scenes, args.seed)
-    print(text)
-    if args.page:
-        report.fill(args.page, text)
+    _show(text, args.page)
     return 0
 
 

@@ -287,14 +287,16 @@ class _Pool:
         best = [votes.argmax()]
         self._append(G[best], squared[best], votes[best], [0])
 
+    def _inliers(self) -> Floats:
+        """Inliers of each hypothesis as ones, in a type that can be multiplied fast, (m, n)."""
+        return (self._squared < self.working**2).astype(np.float32)
+
     def agrees(self) -> bool:
         """Whether draws from two different parts have the best hypothesis's inliers."""
         if len(self) < 2:
             return False
-        inliers = (self._squared < self.working**2).astype(np.float32)
-        common = inliers @ inliers[self.best]
-        union = inliers.sum(axis=1) + common[self.best] - common
-        sizes = self._sizes[(common >= _AGREEMENT * union) & (self._sizes > 0)]
+        inliers = self._inliers()
+        sizes = self._sizes[_alike(inliers, inliers[self.best]) & (self._sizes > 0)]
         return len(sizes) > 1 and bool(sizes.max() >= _DISTINCT * sizes.min())
 
     def refined_best(self) -> NDArray[np.float64]:
@@ -304,12 +306,10 @@ class _Pool:
 
     def before(self, others: Floats) -> _Pool:
         """Put the best hypotheses, of different inliers, to more matches, all equal."""
-        inliers = (self._squared < self.working**2).astype(np.float32)
-        sizes = inliers.sum(axis=1)
+        inliers = self._inliers()
         chosen: list[int] = []
         for i in np.argsort(-self.votes, kind="stable").tolist():
-            common = inliers[chosen] @ inliers[i]
-            if (common < _AGREEMENT * (sizes[chosen] + sizes[i] - common)).all():
+            if not _alike(inliers[chosen], inliers[i]).any():
                 chosen.append(i)
             if len(chosen) == _FINALISTS:
                 break
@@ -329,6 +329,12 @@ class _Pool:
             step = polish(self._frame, G, [width])
             G = G + _STRIDE * (step - G)
         return _refined(self._frame, step[0], self._reliable, self.threshold)
+
+
+def _alike(inliers: Floats, one: Floats) -> Bools:
+    """Which of some inlier sets (m, n) agree with another one (n,)."""
+    common = inliers @ one
+    return np.asarray(common >= _AGREEMENT * (inliers.sum(axis=1) + one.sum() - common))
 
 
 def _refined(frame: Frame, G: Floats, reliable: Ints, threshold: float) -> NDArray[np.float64]:

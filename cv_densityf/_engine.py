@@ -126,15 +126,16 @@ class Robust:
     def plain(
         self, points1: Any, points2: Any
     ) -> tuple[NDArray[np.float64] | None, NDArray[np.uint8] | None]:
-        """Make cv2's own call; (None, None) where its solver raises or finds nothing."""
-        params = self.params
+        """Make cv2's own call; (None, None) where its solver raises or finds nothing.
+
+        The settings are those `for_size`.
+        """
+        asked = self.for_size(len(points1))
+        third: tuple[Any, ...] = (asked.flag, asked.threshold, asked.confidence, asked.max_iters)
+        if asked.params is not None:
+            third = (asked.params,)
         try:
-            if params is not None:
-                F, mask = original(points1, points2, params)
-            else:
-                F, mask = original(
-                    points1, points2, self.flag, self.threshold, self.confidence, self.max_iters
-                )
+            F, mask = original(points1, points2, *third)
         except cv2.error:
             return None, None
         return (F, mask) if F is not None else (None, None)

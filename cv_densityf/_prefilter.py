@@ -77,15 +77,19 @@ def contrast_reliability(X: Floats) -> NDArray[np.float64]:
     return ranks(density_contrast(X))
 
 
+def with_scores(reliability: Floats, scores: Floats) -> NDArray[np.float64]:
+    """Rank of a sum in which a rank by density, which tells more, counts twice that by score."""
+    return ranks(2 * reliability + ranks(scores))
+
+
 def contrast_support(X: Floats, scores: Floats | None = None) -> tuple[NDArray[np.float64], Bools]:
     """Reliability of each match, and the denser half.
 
-    With ``scores`` (n,), higher for more trusted matches, the reliability is the rank of a sum in
-    which the rank of the contrast, which tells more, counts twice that of the score.
+    With ``scores`` (n,), higher for more trusted matches, both count: see `with_scores`.
     """
     reliability = contrast_reliability(X)
     if scores is not None:
-        reliability = ranks(2 * reliability + ranks(scores))
+        reliability = with_scores(reliability, scores)
     return reliability, reliability >= 0.5
 
 

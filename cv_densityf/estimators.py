@@ -33,7 +33,7 @@ from cv_densityf._density import checked_points, density_peaks
 from cv_densityf._display import DecisionGraphDisplay
 from cv_densityf._engine import METHODS, Robust, method_flag
 from cv_densityf._estimate import MIN_FILTERED, run
-from cv_densityf._prefilter import contrast_support, paper_support, ranks
+from cv_densityf._prefilter import contrast_support, paper_support, ranks, with_scores
 
 if TYPE_CHECKING:
     from cv_densityf._epipolar import Rule
@@ -335,7 +335,7 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
         else:
             reliability, support = paper_support(matches, self.alpha, self.dc_percent)
         if weight is not None:
-            reliability = ranks(2 * ranks(reliability) + ranks(weight))
+            reliability = with_scores(ranks(reliability), weight)
         if weight is not None or self.keep is not None:
             n_kept = round(self.keep * n) if self.keep is not None else np.count_nonzero(support)
             support = np.zeros(n, dtype=bool)
@@ -739,7 +739,7 @@ def _plain_estimate(
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.bool_]]:
     """Call cv2 on the candidates, and on all rows where that fails; F and the rows it is from."""
     drawn = matches[candidates]
-    F, _ = robust.for_size(len(drawn)).plain(drawn[:, :2], drawn[:, 2:])
+    F, _ = robust.plain(drawn[:, :2], drawn[:, 2:])
     if F is None and not candidates.all():
         warnings.warn(
             f"no fundamental matrix from the {len(drawn)} rows that the prefilter kept: all "
