@@ -216,6 +216,13 @@ def _stages(args: argparse.Namespace) -> int:
     return 0
 
 
+def _show(text: str, page: str | None) -> None:
+    """Print a report, and bring the tables of a page up to date with it."""
+    print(text)
+    if page:
+        report.fill(page, text)
+
+
 def _scale(args: argparse.Namespace) -> int:
     _show(scale(args.n, args.cluster_n, args.scenes, args.scene, args.plot), args.page)
     return 0

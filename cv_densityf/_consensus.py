@@ -24,18 +24,19 @@ Floats = NDArray[np.floating]
 Ints = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 
-#: Draws from the matches within a few thresholds of the best hypothesis so far, dense or not.
+#: Draws from the ranked matches within a few thresholds of the best hypothesis so far.
 NEAR = 0.0
-#: Shares of the matches, most reliable first, that hypotheses are drawn from, round by round.
-ROUNDS = ((0.25, 0.5), (0.75, NEAR), (0.125, 1.0), (0.5, NEAR), (0.25, 1.0))
+#: Draws from all matches, whatever the density says, in the order of the caller's scores.
+BY_SCORE = -1.0
+#: Shares of the ranked matches, most reliable first, that hypotheses are drawn from, round by
+#: round.
+ROUNDS = ((0.25, 0.5), (BY_SCORE, 0.75, NEAR), (0.125, 1.0), (0.5, NEAR), (0.25, 1.0))
 _NEAR_WIDTH = 8.0
 #: Matches a draw gets at least: fewer crowd on too little of the image to fix F.
 MIN_DRAW = 30
-#: cv2's iterations in one draw from a quarter of the matches, and less from larger, less pure
-#: parts. More find no better F; several short draws do.
+#: cv2's iterations in one draw by score or from a quarter of the ranked matches, and less from
+#: larger, less pure parts. More find no better F; several short draws do.
 MAX_DRAW_ITERS = 1000
-#: cv2's iterations in the draw that follows the caller's scores through all matches.
-MAX_RANKED_ITERS = 5 * MAX_DRAW_ITERS
 #: Two hypotheses agree when their inlier sets have this intersection over union.
 _AGREEMENT = 0.93
 #: Draws from parts whose sizes differ by less than this factor are not independent.
@@ -113,7 +114,8 @@ def search(
     X : array, shape (n, 4)
         Finite matches.
     reliability : array, shape (n,)
-        Weight of each match's vote, in [0, 1]; also the order of the draws.
+        Weight of each match's vote, in [0, 1]; also the order of the draws. NaN where it is not
+        known: such a match is in no draw by density and has half a vote.
     threshold : float
         Of the draws, pixels. The mask has one of its own, the caller's.
     confidence, max_iters
@@ -125,8 +127,8 @@ def search(
     about : (array, float), optional
         What `middle` says of X, if it is known.
     scores : array, shape (n,), optional
-        The caller's trust in each match: one more draw takes its samples in this order, whatever
-        the density says.
+        The caller's trust in each match: one more draw, in the second round, takes its samples in
+        this order, whatever the density says.
     others : array, shape (k, 4), optional
         Matches that are not searched: with the rest they vote on the best hypotheses, and polish
         the winner.
@@ -136,48 +138,42 @@ def search(
     Consensus or None
         None if no draw found a fundamental matrix.
     """
-    n = len(X)
     # Far from the origin the float32 that cv2 draws with would eat the pixels.
     centre, spread = about or middle(X)
     X = X - centre
-    order = np.argsort(-reliability, kind="stable")
+    order = np.argsort(-reliability, kind="stable")[: np.count_nonzero(reliability >= 0.0)]
+    n_ranked = len(order)
     points = X[order].astype(np.float32)
-    reliable = order[: max(MIN_DRAW, n // 2)]
+    reliable = order[: max(MIN_DRAW, n_ranked // 2)]
     frame = Frame(X, (np.zeros(4), spread))
     rng = np.random.default_rng(abs(seed))
-    pool = _Pool(X, reliability, reliable, threshold, rng, frame)
+    pool = _Pool(X, np.nan_to_num(reliability, nan=0.5), reliable, threshold, rng, frame)
     n_draws = 0
-    found, sizes = [], []
-    if scores is not None:
-        ranked = X[np.argsort(-scores, kind="stable")].astype(np.float32)
-        iters = min(max_iters, MAX_RANKED_ITERS)
-        F = draw(ranked, threshold, confidence, iters, seed, best_first=True)
-        n_draws = 1
-        if F is not None:
-            found.append(F)
-            sizes.append(n)
     for fractions in ROUNDS:
+        found, sizes = [], []
         for fraction in fractions:
-            if fraction != NEAR:
-                part = points[: max(MIN_DRAW, int(n * fraction))]
-            elif len(pool):
+            if fraction == BY_SCORE:
+                if scores is None:
+                    continue
+                part = X[np.argsort(-scores, kind="stable")].astype(np.float32)
+            elif fraction == NEAR:
+                if not len(pool):
+                    continue
                 part = points[pool.near_best(_NEAR_WIDTH)[order]]
             else:
-                continue
-            share = max(len(part) / n, 0.25)
+                part = points[: max(MIN_DRAW, int(n_ranked * fraction))]
+            by_score = fraction == BY_SCORE
+            share = 0.25 if by_score else max(len(part) / n_ranked, 0.25)
             iters = min(max_iters, int(MAX_DRAW_ITERS * np.sqrt(0.25 / share)))
-            F = draw(part, pool.working, confidence, iters, seed + n_draws)
+            F = draw(part, pool.working, confidence, iters, seed + n_draws, best_first=by_score)
             n_draws += 1
             if F is not None:
                 found.append(F)
                 sizes.append(len(part))
         watch.lap("draws")
         if found:
-            first = len(pool) == 0
-            pool.add(np.stack(found), sizes)
-            if first:
-                pool.adapt()
-            found, sizes = [], []
+            F = np.stack(found)
+            pool.add(F if len(pool) else pool.adapted(F), sizes)
         watch.lap("polish")
         agreed = pool.agrees()
         if agreed:
@@ -235,8 +231,7 @@ class _Pool:
 
     def add(self, F: Floats, sizes: ArrayLike) -> None:
         """Polish hypotheses (m, 3, 3), in pixels, drawn from ``sizes`` matches, and count votes."""
-        widths = [_POLISH_WIDTH * self.working] * _POLISH_STEPS
-        G = polish(self._frame, self._frame.enter(F), widths)
+        G = self._polished(F)
         self._append(G, *self._poll(G), sizes)
 
     def _append(self, G: Floats, squared: Floats, votes: Floats, sizes: ArrayLike) -> None:
@@ -252,15 +247,18 @@ class _Pool:
         credit = np.sqrt(essential_ratio(G))
         return squared, self._ballot.count(squared, self.working) * credit
 
-    def adapt(self) -> None:
-        """Narrow the working threshold to the noise of the best hypothesis so far."""
-        scale = _SIGMAS * _noise(self._squared[self.best, self._reliable], self.threshold)
-        if scale < self.threshold:
-            self.working = max(scale, _SMALLEST_SCALE * self.threshold)
-            F, sizes = self._frame.leave(self._G), self._sizes
-            self._G, self._squared = self._G[:0], self._squared[:0]
-            self.votes, self._sizes = self.votes[:0], self._sizes[:0]
-            self.add(F, sizes)
+    def adapted(self, F: Floats) -> Floats:
+        """Polish F (m, 3, 3), pixels, and narrow the working threshold to the best one's noise."""
+        G = self._polished(F)
+        squared = self._frame.sampson(G)
+        best = self._ballot.count(squared, self.working).argmax()
+        scale = _SIGMAS * _noise(squared[best, self._reliable], self.threshold)
+        self.working = max(min(scale, self.threshold), _SMALLEST_SCALE * self.threshold)
+        return self._frame.leave(G)
+
+    def _polished(self, F: Floats) -> Floats:
+        widths = [_POLISH_WIDTH * self.working] * _POLISH_STEPS
+        return polish(self._frame, self._frame.enter(F), widths)
 
     def near_best(self, width: float) -> Bools:
         """Mark the matches within ``width`` working thresholds of the best hypothesis."""
@@ -340,8 +338,9 @@ def _alike(inliers: Floats, one: Floats) -> Bools:
 def _refined(frame: Frame, G: Floats, reliable: Ints, threshold: float) -> NDArray[np.float64]:
     G = G[None]
     for _ in range(_REFINE_STEPS):
-        width = _REFINE_SIGMAS * _noise(frame.sampson(G)[0, reliable], threshold)
-        G = polish(frame, G, [max(width, _NARROWEST * threshold)])
+        noise = _noise(frame.sampson(G)[0, reliable], threshold)
+        width = max(_REFINE_SIGMAS * noise, _NARROWEST * threshold)
+        G = polish(frame, G, [width], noise)
     return np.ascontiguousarray(frame.leave(G)[0])
 
 
@@ -390,10 +389,11 @@ class _Ballot:
 
 def _cells(points: Floats) -> tuple[Ints, Ints]:
     """Rows sorted by grid cell, and where each occupied cell starts."""
-    low = points.min(axis=0)
-    side = max(float((points.max(axis=0) - low).max()), 1e-9)
-    column = np.minimum((points - low) * (_GRID / side), _GRID - 1).astype(np.intp)
-    cell = column[:, 0] * _GRID + column[:, 1]
+    columns = np.ascontiguousarray(points.T)
+    columns = columns - columns.min(axis=1, keepdims=True)
+    side = max(float(columns.max()), 1e-9)
+    place = np.minimum(columns * (_GRID / side), _GRID - 1).astype(np.intp)
+    cell = place[0] * _GRID + place[1]
     # Of so small integers numpy sorts by their digits.
     order = np.argsort(cell.astype(np.uint16), kind="stable")
     cell = cell[order]

@@ -123,10 +123,9 @@ class Frame:
         for i in range(9):
             np.multiply(self.products[i], self.products[i:], out=self.outer[row : row + 9 - i])
             row += 9 - i
-        zoom = np.diag([self.scale, self.scale, 1.0])
-        self._first = zoom @ shift(-centre[:2])
-        self._second = zoom @ shift(-centre[2:])
-        self._from_first, self._from_second = np.linalg.inv([self._first, self._second])
+        zoom, unzoom = (np.diag([s, s, 1.0]) for s in (self.scale, 1.0 / self.scale))
+        self._first, self._from_first = zoom @ shift(-centre[:2]), shift(centre[:2]) @ unzoom
+        self._second, self._from_second = zoom @ shift(-centre[2:]), shift(centre[2:]) @ unzoom
 
     def part(self, rows: NDArray[np.bool_]) -> Frame:
         """Return the same frame, holding only the matches marked in ``rows`` (n,)."""
@@ -160,14 +159,16 @@ class Frame:
 
 def middle(X: Floats) -> tuple[Floats, float]:
     """Centroid (4,) of the matches and standard deviation about it, but for matches far out."""
+    # Along rows: numpy takes several times as long across columns so few.
+    columns = np.ascontiguousarray(X.T)
     half = len(X) // 2
-    away = np.abs(X - np.partition(X, half, axis=0)[half]).max(axis=1)
+    away = np.abs(columns - np.partition(columns, half, axis=1)[:, half, None]).max(axis=0)
     # Three quarters and not half, since half may be copies of one match.
     most = 3 * len(X) // 4
     reach = FAR * np.partition(away, most)[most]
-    near = X[away <= reach] if reach > 0 else X
-    centre = near.mean(axis=0)
-    return centre, float(np.sqrt(((near - centre) ** 2).mean()))
+    near = columns[:, away <= reach] if reach > 0 else columns
+    centre = near.mean(axis=1)
+    return centre, float(np.sqrt(((near - centre[:, None]) ** 2).mean()))
 
 
 def shift(by: Floats) -> NDArray[np.float64]:
@@ -178,16 +179,20 @@ def shift(by: Floats) -> NDArray[np.float64]:
 _TINY = 1e-300
 #: Matches this many times as far out as three quarters of them cannot be in the image.
 FAR = 5.0
-#: Generators of the rotations about the three axes.
-_SKEW = np.zeros((3, 3, 3))
-_SKEW[0, 2, 1] = _SKEW[1, 0, 2] = _SKEW[2, 1, 0] = 1.0
-_SKEW[0, 1, 2] = _SKEW[1, 2, 0] = _SKEW[2, 0, 1] = -1.0
-_HALF_SKEW = 0.5 * _SKEW.reshape(3, 9)
-_EYE = np.eye(3)
-
-
+_EYE = np.eye(7)
+#: Of the products u_i v_j^T, row by row, those of a tangent space: not u_3 v_3^T, and u_1 v_1^T
+#: makes room for what u_1 v_1^T and u_2 v_2^T have left.
+_TANGENT = np.array([0, 1, 2, 3, 5, 6, 7])
+#: How far the essential ratio of a right matrix may well fall short of 1, and from where on this
+#: tells little, for the camera may be of another kind.
+_SHORTFALL = 0.005
+_FOREIGN = 0.02
+#: By which slopes are taken, of a matrix of unit norm.
+_NUDGE = 1e-4
+#: The other two rows of a matrix for each row, as of columns: cofactors are products of these.
+_NEXT, _LAST = np.array([[1], [2], [0]]), np.array([[2], [0], [1]])
 #: Squared focal lengths, in sizes of the image: from wide angle to telephoto.
-_FOCAL_SQUARED = np.geomspace(0.5, 4.0, 8) ** 2
+_FOCAL_SQUARED = np.geomspace(0.5, 4.0, 16) ** 2
 _ONES = np.ones_like(_FOCAL_SQUARED)
 #: What the focal length multiplies the squares of a matrix's rows by, and of its cofactors' rows.
 _ENTRY_GAIN = np.stack([_FOCAL_SQUARED, _FOCAL_SQUARED, _ONES])
@@ -212,15 +217,11 @@ def essential_ratio(F: Floats, image_size: float = np.sqrt(12.0)) -> NDArray[np.
     """
     zoom = np.array([image_size, image_size, 1.0])
     F = F * np.outer(zoom, zoom)
-    U, S, Vt = np.linalg.svd(F)
+    cofactors = F[:, _NEXT, _NEXT.T] * F[:, _LAST, _LAST.T]
+    cofactors -= F[:, _NEXT, _LAST.T] * F[:, _LAST, _NEXT.T]
     # Of K'^T F K: the sum of the squared singular values, and twice their product.
     total = _ENTRY_GAIN.T @ F**2 @ _ENTRY_GAIN
-    epipole2, epipole1 = U[:, :, 2] ** 2 @ _COFACTOR_GAIN, Vt[:, 2] ** 2 @ _COFACTOR_GAIN
-    twice = (
-        2.0
-        * (S[:, 0] * S[:, 1])[:, None, None]
-        * np.sqrt(epipole2[:, :, None] * epipole1[:, None, :])
-    )
+    twice = 2.0 * np.sqrt(_COFACTOR_GAIN.T @ cofactors**2 @ _COFACTOR_GAIN)
     difference = np.sqrt(np.maximum(total - twice, 0.0))
     both = np.sqrt(total + twice)
     return np.asarray(((both - difference) / (both + difference)).max(axis=(1, 2)))
@@ -263,14 +264,16 @@ def eight_point(samples: Floats) -> NDArray[np.float64]:
     return np.asarray(F / np.linalg.norm(F, axis=(1, 2), keepdims=True))
 
 
-def polish(frame: Frame, G: Floats, scales: Sequence[float | Floats]) -> Floats:
+def polish(
+    frame: Frame, G: Floats, scales: Sequence[float | Floats], noise: float | None = None
+) -> Floats:
     """Refine fundamental matrices on all matches, one weighted Gauss-Newton step per scale.
 
     Minimises the Sampson distances under Geman-McClure weights ``1 / (1 + (r / scale)^2)^2`` over
-    the seven degrees of freedom of a rank-2 matrix ``U diag(cos a, sin a, 0) V^T`` (Bartoli and
-    Sturm, "Nonlinear estimation of the fundamental matrix with minimal parameters", 2004). The
-    gradient norm in the Sampson distance is held fixed within a step, as in iteratively reweighted
-    least squares.
+    the seven degrees of freedom of a matrix of rank 2: a step in the tangent space at
+    ``U diag(s_1, s_2, 0) V^T``, then the nearest matrix of rank 2 (Absil, Mahony and Sepulchre,
+    "Optimization algorithms on matrix manifolds", 2008). The gradient norm in the Sampson distance
+    is held fixed within a step, as in iteratively reweighted least squares.
 
     Parameters
     ----------
@@ -280,50 +283,50 @@ def polish(frame: Frame, G: Floats, scales: Sequence[float | Floats]) -> Floats:
         Starting matrices in the frame.
     scales : sequence of float or of arrays of shape (m,)
         Width of the weights in pixels, step by step.
+    noise : float, optional
+        Standard deviation of right residuals, pixels. If given, the cameras weigh in: how far
+        `essential_ratio` falls short of 1 is one more residual, of standard deviation
+        ``_SHORTFALL`` and with Cauchy's weights of width ``_FOREIGN``. It tells where the matches
+        do not, and gives way where they contradict or the cameras are of another kind.
 
     Returns
     -------
     array, shape (m, 3, 3)
         Refined matrices of rank 2 and unit norm, in the frame.
     """
-    U, S, Vt = np.linalg.svd(G)
-    angle = np.arctan2(S[:, 1], S[:, 0])
     m = len(G)
-    D = np.zeros((m, 3, 3))
     for scale in scales:
-        c, s = np.cos(angle), np.sin(angle)
-        D[:, 0, 0], D[:, 1, 1] = c, s
-        G = U @ D @ Vt
+        G, U, S, Vt = _rank_two(G)
+        # The directions u_i v_j^T in which the rank stays two, and the one that keeps the norm.
+        outer = (U.transpose(0, 2, 1)[:, :, None, :, None] * Vt[:, None, :, None]).reshape(m, 9, 9)
+        tangent = outer[:, _TANGENT]
+        tangent[:, 0] = S[:, :1] * outer[:, 4] - S[:, 1:2] * outer[:, 0]
         algebraic, norm = frame.errors(G)
         norm += _TINY
         width = np.asarray(scale, dtype=float).reshape(-1, 1) * frame.scale
         weight = 1.0 / (1.0 + algebraic * algebraic / (norm * width**2))
         weight *= weight / norm
         gram = (weight @ frame.outer.T)[:, _SQUARE]
-        W = np.empty((m, 7, 3, 3))
-        W[:, :3] = _SKEW @ D[:, None]
-        W[:, 3:6] = D[:, None] @ _SKEW
-        W[:, 6] = 0.0
-        W[:, 6, 0, 0], W[:, 6, 1, 1] = -s, c
-        tangent = (U[:, None] @ W @ Vt[:, None]).reshape(m, 7, 9)
         half = tangent @ gram
         hessian = half @ tangent.transpose(0, 2, 1)
         gradient = half @ G.reshape(m, 9, 1)
+        if noise is not None:
+            nudge = _NUDGE * tangent.reshape(m, 7, 3, 3)
+            nudged = G[:, None] + np.concatenate([0.0 * nudge[:, :1], nudge, -nudge], 1)
+            lack = 1.0 - essential_ratio(nudged.reshape(-1, 3, 3)).reshape(m, 15)
+            lack, slope = lack[:, :1], (lack[:, 1:8] - lack[:, 8:]) / (2.0 * _NUDGE)
+            pull = (noise * frame.scale / _SHORTFALL) ** 2 / (1.0 + (lack / _FOREIGN) ** 2) * slope
+            hessian += pull[:, :, None] * slope[:, None]
+            gradient += (pull * lack)[:, :, None]
         damping = 1e-9 * np.einsum("mkk->m", hessian) + _TINY
-        np.einsum("mkk->mk", hessian)[...] += damping[:, None]
-        step = -np.linalg.solve(hessian, gradient)[:, :, 0]
-        length = np.sqrt(np.einsum("mk,mk->m", step, step))
-        step *= np.minimum(1.0, 0.5 / (length + _TINY))[:, None]
-        rotation = _rotation(step[:, :6].reshape(-1, 3)).reshape(m, 2, 3, 3)
-        U = U @ rotation[:, 0]
-        Vt = rotation[:, 1] @ Vt
-        angle = angle + step[:, 6]
-    D[:, 0, 0], D[:, 1, 1] = np.cos(angle), np.sin(angle)
-    return np.asarray(U @ D @ Vt)
+        step = -np.linalg.solve(hessian + damping[:, None, None] * _EYE, gradient)
+        step *= np.minimum(1.0, 0.5 / (np.sqrt((step * step).sum(axis=1, keepdims=True)) + _TINY))
+        G = G + (step.transpose(0, 2, 1) @ tangent).reshape(m, 3, 3)
+    return _rank_two(G)[0]
 
 
-def _rotation(axis: Floats) -> Floats:
-    """Cayley's rotation for small axis vectors (m, 3); equal to the exponential to second order."""
-    K = (axis @ _HALF_SKEW).reshape(-1, 3, 3)
-    shrink = 2.0 / (1.0 + 0.25 * np.einsum("mk,mk->m", axis, axis))
-    return np.asarray(_EYE + (K + K @ K) * shrink[:, None, None])
+def _rank_two(G: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Nearest matrices (m, 3, 3) of rank 2 and of unit norm, and U, S, V^T of these."""
+    U, S, Vt = np.linalg.svd(G)
+    S = S[:, :2] / np.hypot(S[:, :1], S[:, 1:2])
+    return (U[:, :, :2] * S[:, None]) @ Vt[:, :2], U, S, Vt

@@ -30,6 +30,8 @@ MIN_FILTERED = 15
 MAX_SEARCHED = 5_000
 #: They do help to choose and to measure it, up to what memory should bear.
 MAX_REFINED = 100_000
+#: Of as many of those that search the density is looked at, and hypotheses are drawn.
+MAX_RANKED = 1_000
 #: A part is spread over cells of the first image, and in each of them over cells of the second:
 #: this many to the longer side.
 _CELLS = (16, 8)
@@ -164,7 +166,8 @@ def _estimate(
     if density == "paper":
         r, support = paper_support(Z, alpha, dc_percent)
     else:
-        r, support = contrast_support(Z, trust)
+        ranked = _spread(Z, MAX_RANKED, np.random.default_rng(abs(seed)))
+        r, support = contrast_support(Z, trust, ranked)
     reliability = np.full(n, np.nan)
     reliability[rows] = r
     kept = np.zeros(n, dtype=bool)
@@ -262,9 +265,10 @@ def finite_in_cv2(X: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 def _on_a_line(X: NDArray[np.float64]) -> bool:
     """Whether an image's points lie on one line, or on one spot, as far as float32 can tell."""
-    largest = np.abs(X).max(axis=0)
-    centred = X - X.mean(axis=0)
-    covariance = centred.T @ centred / len(X)
+    columns = np.ascontiguousarray(X.T)
+    largest = np.abs(columns).max(axis=1)
+    centred = columns - columns.mean(axis=1, keepdims=True)
+    covariance = centred @ centred.T / len(X)
     for image in (slice(0, 2), slice(2, 4)):
         (a, b), (_, d) = covariance[image, image]
         smallest = 0.5 * (a + d - np.hypot(a - d, 2.0 * b))

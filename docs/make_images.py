@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from cv_densityf import density_peaks, estimate_fundamental
 from cv_densityf._epipolar import sampson_distance
-from cv_densityf._prefilter import N_NEIGHBORS, contrast_reliability
+from cv_densityf._prefilter import N_NEIGHBORS, contrast_support
 from cv_densityf.datasets import motorcycle
 from cv_densityf.matching import match_images
 from cv_densityf.plotting import plot_decision_graph, plot_epipolar_lines, plot_matches
@@ -121,7 +121,7 @@ def neighbours(greys: list[np.ndarray], X: np.ndarray, right: np.ndarray) -> plt
 
 def contrast(grey: np.ndarray, X: np.ndarray, right: np.ndarray) -> plt.Figure:
     """Show where reliable matches are, and how pure the best of them are."""
-    reliability = contrast_reliability(X)
+    reliability = contrast_support(X)[0]
     figure, (left, curve) = plt.subplots(
         1, 2, figsize=(12, 4.6), layout="constrained", width_ratios=(1.35, 1)
     )

@@ -290,7 +290,7 @@ def test_seven_matches_have_up_to_three_matrices_below_each_other():
 
 def test_where_no_draw_holds_cv2_answers(monkeypatch):
     X = scene_of().X
-    monkeypatch.setattr("cv_densityf._consensus.draw", lambda *_: None)
+    monkeypatch.setattr("cv_densityf._consensus.draw", lambda *_, **__: None)
     result = estimate(X, method="ransac")
     F, mask = original(X[:, :2], X[:, 2:], cv2.FM_RANSAC, 1.0, 0.999, 5000)
     np.testing.assert_array_equal(result.F, F)
