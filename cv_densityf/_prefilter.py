@@ -13,7 +13,7 @@ Ints = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 
 #: Neighbours looked at around each match, in each image.
-N_NEIGHBORS = 12
+N_NEIGHBORS = 16
 #: cv2's exact search in few dimensions, KDTREE_SINGLE; on so few points twice as fast as scipy's.
 _KD_TREE: dict[str, bool | int | float | str] = {"algorithm": 4}
 _EXACT: dict[str, bool | int | float | str] = {"checks": -1}
