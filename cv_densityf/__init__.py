@@ -5,12 +5,12 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from cv_densityf._density import DensityPeaksResult, density_peaks
 from cv_densityf._estimate import Estimate, estimate_fundamental
 from cv_densityf._zhang import epipolar_distance
 from cv_densityf.cv2_api import findFundamentalMat
 
 if TYPE_CHECKING:
+    from cv_densityf._density import DensityPeaksResult, density_peaks
     from cv_densityf._files import InputError
     from cv_densityf.batch import estimate_many
     from cv_densityf.estimators import (
@@ -24,14 +24,16 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-#: Public names whose modules import more than cv2 and scipy: loaded when first asked for.
+#: Public names whose modules import more than cv2: loaded when first asked for.
 _LAZY = {
     "DecisionGraphDisplay": "estimators",
     "DensityPeaks": "estimators",
     "DensityPeaksFilter": "estimators",
+    "DensityPeaksResult": "_density",
     "FundamentalMatrixEstimator": "estimators",
     "InputError": "_files",
     "Matches": "matching",
+    "density_peaks": "_density",
     "estimate_many": "batch",
     "is_patched": "patching",
     "match_images": "matching",

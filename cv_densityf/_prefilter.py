@@ -6,8 +6,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cv_densityf._density import density_peaks
-
 Floats = NDArray[np.floating]
 Ints = NDArray[np.intp]
 Bools = NDArray[np.bool_]
@@ -113,6 +111,9 @@ def paper_support(X: Floats, alpha: float, dc_percent: float) -> tuple[NDArray[n
     The rule of Wu and Wan, section 2.6: a match whose rho * delta is lower than
     alpha * rho_max * delta_max is an outlier.
     """
+    # Only this rule needs scipy, whose import takes as long as cv2's.
+    from cv_densityf._density import density_peaks
+
     peaks = density_peaks(X, dc_percent=dc_percent)
     scale = float(peaks.rho.max() * peaks.delta.max())
     reliability = peaks.gamma / scale if scale > 0 else np.ones(len(X))

@@ -23,7 +23,7 @@ def main() -> None:
     assert folder.parent != Path(__file__).parents[1], "this is the repository, not an installation"
     assert (folder / "py.typed").is_file()
     assert metadata.version("cv-densityf") == cv_densityf.__version__
-    heavy = {"sklearn", "matplotlib", "skimage", "pycolmap"} & set(sys.modules)
+    heavy = {"scipy", "sklearn", "matplotlib", "skimage", "pycolmap"} & set(sys.modules)
     assert not heavy, f"import cv_densityf also imports {heavy}"
     assert all(getattr(cv_densityf, name) for name in cv_densityf.__all__)
 
