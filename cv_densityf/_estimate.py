@@ -60,9 +60,10 @@ class Estimate:
     mask : array, shape (n,), bool
         Inliers by the method's own rule.
     kept : array, shape (n,), bool
-        The dense part: matches the density rule holds reliable.
+        The dense part: matches the density rule holds reliable. Of more than a thousand it looks at
+        a thousand, spread over both images.
     reliability : array, shape (n,), float64
-        From 0 (isolated) to 1 (densest); NaN for matches the search did not look at.
+        From 0 (isolated) to 1 (densest); NaN for matches whose density was not looked at.
     n_draws : int
         Hypotheses drawn; 0 if cv2's own call answered.
     engine : str
@@ -349,7 +350,7 @@ def estimate_fundamental(
     confidence : float
         Of each draw to have found the best model, in (0, 1).
     max_iters : int
-        Bound on the iterations of each draw, at least 1. The default rule's draws end after a few
+        Bound on the iterations of each draw, at least 1. The default rule's draws end after a
         thousand in any case, those of ``"paper"`` and of cv2's own call only here.
     density : {"contrast", "paper", "off"}
         Rule for the dense part: density contrast, Wu and Wan's rho * delta, or none.

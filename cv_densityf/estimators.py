@@ -423,7 +423,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
     confidence : float in (0, 1), default=0.999
         Wanted probability that the result is right.
     max_iters : int >= 1, default=5000
-        Bound on the iterations of each draw; those of ``prefilter="auto"`` end after a few thousand
+        Bound on the iterations of each draw; those of ``prefilter="auto"`` end after a thousand
         in any case.
     random_state : int, RandomState or None, default=0
         Seed of the pipeline of ``prefilter="auto"``. None takes one from numpy's global state.
