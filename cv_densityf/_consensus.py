@@ -103,7 +103,7 @@ def search(
 ) -> Consensus | None:
     """Search for the fundamental matrix that the reliable and well spread matches vote for.
 
-    Rounds of two draws on nested sets of the most reliable matches, on all of them, and on what
+    Rounds of draws on nested sets of the most reliable matches, on all that are ranked, and on what
     the best hypothesis so far leaves near its epipolar lines: a nearly right F has the right one's
     inliers there. Each hypothesis is polished on all matches. The search ends when a second,
     independent draw arrives at the winner's inliers, or after `ROUNDS` and a local optimisation of

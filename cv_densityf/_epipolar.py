@@ -185,8 +185,8 @@ _EYE = np.eye(7)
 _TANGENT = np.array([0, 1, 2, 3, 5, 6, 7])
 #: How far the essential ratio of a right matrix may well fall short of 1, and from where on this
 #: tells little, for the camera may be of another kind.
-_SHORTFALL = 0.005
-_FOREIGN = 0.02
+_SHORTFALL = 0.01
+_FOREIGN = 0.03
 #: By which slopes are taken, of a matrix of unit norm.
 _NUDGE = 1e-4
 #: The other two rows of a matrix for each row, as of columns: cofactors are products of these.
@@ -287,7 +287,7 @@ def polish(
         Standard deviation of right residuals, pixels. If given, the cameras weigh in: how far
         `essential_ratio` falls short of 1 is one more residual, of standard deviation
         ``_SHORTFALL`` and with Cauchy's weights of width ``_FOREIGN``. It tells where the matches
-        do not, and gives way where they contradict or the cameras are of another kind.
+        do not, and loses its say where the cameras seem to be of another kind.
 
     Returns
     -------
@@ -315,7 +315,9 @@ def polish(
             nudged = G[:, None] + np.concatenate([0.0 * nudge[:, :1], nudge, -nudge], 1)
             lack = 1.0 - essential_ratio(nudged.reshape(-1, 3, 3)).reshape(m, 15)
             lack, slope = lack[:, :1], (lack[:, 1:8] - lack[:, 8:]) / (2.0 * _NUDGE)
-            pull = (noise * frame.scale / _SHORTFALL) ** 2 / (1.0 + (lack / _FOREIGN) ** 2) * slope
+            pull = (
+                np.square(noise * frame.scale / _SHORTFALL) / (1.0 + (lack / _FOREIGN) ** 2) * slope
+            )
             hessian += pull[:, :, None] * slope[:, None]
             gradient += (pull * lack)[:, :, None]
         damping = 1e-9 * np.einsum("mkk->m", hessian) + _TINY

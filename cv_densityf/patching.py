@@ -40,7 +40,8 @@ class CallSite:
     no_model : int
         Calls, not passed on, that found no fundamental matrix.
     kept, dropped : int
-        Matches of the dense part, and the rest, over all calls not passed on.
+        Matches of the dense part, and the rest, over all calls not passed on. Of a call with more
+        than a thousand matches, those whose density was not looked at are among the rest.
     """
 
     filename: str
