@@ -353,17 +353,23 @@ def test_with_the_cameras_polish_lowers_the_joint_cost(seed):
     assert essential_ratio(both)[0] > essential_ratio(without)[0] - 1e-3
 
 
-def test_cameras_hardly_move_what_many_matches_tell():
-    moved = []
-    for seed in range(10):
-        scene = noisy_scene(seed, n=2000, noise=0.5)
+@pytest.mark.parametrize(("n", "noise"), [(200, 2.0), (500, 1.0), (2000, 0.5)])
+def test_cameras_hardly_move_what_matches_tell(n, noise):
+    """With normal noise least squares alone are as good as can be; wrong matches fill the images."""
+    ratios = []
+    for seed in range(40):
+        scene = noisy_scene(seed, n=n, inlier_ratio=0.5, noise=noise)
         frame = Frame(scene.X)
         start = frame.enter(scene.F[None])
-        without, both = (polish(frame, start, [1.5] * 10, noise) for noise in (None, 0.5))
         true = exact_scene(seed, 300).X
-        errors = [sampson_distance(frame.leave(G)[0], true).mean() for G in (without, both)]
-        moved.append(errors[1] / errors[0])
-    assert np.median(moved) < 1.1
+        without, both = (
+            sampson_distance(
+                frame.leave(polish(frame, start, [3 * noise] * 4, told))[0], true
+            ).mean()
+            for told in (None, noise)
+        )
+        ratios.append(both / without)
+    assert np.exp(np.log(ratios).mean()) < 1.05
 
 
 def test_matches_without_noise_need_no_cameras():
