@@ -355,7 +355,7 @@ def test_with_the_cameras_polish_lowers_the_joint_cost(seed):
 
 @pytest.mark.parametrize(("n", "noise"), [(200, 2.0), (500, 1.0), (2000, 0.5)])
 def test_cameras_hardly_move_what_matches_tell(n, noise):
-    """With normal noise least squares alone are as good as can be; wrong matches fill the images."""
+    """With normal noise least squares alone are as good as can be; wrong ones fill the images."""
     ratios = []
     for seed in range(40):
         scene = noisy_scene(seed, n=n, inlier_ratio=0.5, noise=noise)
