@@ -152,17 +152,15 @@ def search(
     for fractions in ROUNDS:
         found, sizes = [], []
         for fraction in fractions:
-            if fraction == BY_SCORE:
-                if scores is None:
-                    continue
-                part = X[np.argsort(-scores, kind="stable")].astype(np.float32)
-            elif fraction == NEAR:
-                if not len(pool):
-                    continue
-                part = points[pool.near_best(_NEAR_WIDTH)[order]]
-            else:
-                part = points[: max(MIN_DRAW, int(n_ranked * fraction))]
             by_score = fraction == BY_SCORE
+            if by_score and scores is not None:
+                part = X[np.argsort(-scores, kind="stable")].astype(np.float32)
+            elif fraction == NEAR and len(pool):
+                part = points[pool.near_best(_NEAR_WIDTH)[order]]
+            elif fraction > 0.0:
+                part = points[: max(MIN_DRAW, int(n_ranked * fraction))]
+            else:
+                continue
             share = 0.25 if by_score else max(len(part) / n_ranked, 0.25)
             iters = min(max_iters, int(MAX_DRAW_ITERS * np.sqrt(0.25 / share)))
             F = draw(part, pool.working, confidence, iters, seed + n_draws, best_first=by_score)

@@ -56,13 +56,12 @@ def density_contrast(
     indices = [cv2.flann.Index(half, _KD_TREE) for half in halves]
     # A match is its own first neighbour, at place 0, or a copy of it is.
     weight = 1.0 / np.maximum(np.arange(k), 1)
-    asked = n if rows is None else len(rows)
-    contrast = np.empty(asked)
-    for start in range(0, asked, _CHUNK):
+    rows = np.arange(n) if rows is None else rows
+    contrast = np.empty(len(rows))
+    for start in range(0, len(rows), _CHUNK):
         chunk = slice(start, start + _CHUNK)
-        part = chunk if rows is None else rows[chunk]
         (near1, squared1), (near2, squared2) = (
-            index.knnSearch(half[part], k, params=_EXACT)
+            index.knnSearch(half[rows[chunk]], k, params=_EXACT)
             for index, half in zip(indices, halves, strict=True)
         )
         shared = np.flatnonzero(near1[:, :, None] == near2[:, None, :])

@@ -56,6 +56,18 @@ def test_contrast_is_the_definition(n, k):
     np.testing.assert_allclose(density_contrast(X, k), expected, rtol=1e-12)
 
 
+@pytest.mark.parametrize("columns", [slice(0, 2), slice(2, 4)])
+def test_contrast_is_the_definition_where_two_matches_share_a_point(columns):
+    """As a keypoint with two orientations may: neither is then sure to stand first in its list."""
+    X = scene_of(8, 80).X
+    X[40, columns] = X[0, columns]
+    # For all others these two are equally near, in either order.
+    two = [0, 40]
+    np.testing.assert_allclose(
+        density_contrast(X, 7)[two], contrast_by_definition(X, 7)[two], rtol=1e-12
+    )
+
+
 def test_contrast_looks_at_ten_neighbours_unless_told():
     X = scene_of(0, 60).X
     np.testing.assert_array_equal(density_contrast(X), density_contrast(X, N_NEIGHBORS))
