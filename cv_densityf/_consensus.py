@@ -37,8 +37,10 @@ MIN_DRAW = 30
 #: cv2's iterations in one draw by score or from a quarter of the ranked matches, and less from
 #: larger, less pure parts. More find no better F; several short draws do.
 MAX_DRAW_ITERS = 1000
-#: Two hypotheses agree when their inlier sets have this intersection over union.
+#: Two hypotheses agree when their inlier sets have this intersection over union; then there are no
+#: more draws. If it is less than the second, local optimisation has something to gain.
 _AGREEMENT = 0.93
+_CLOSE_AGREEMENT = 0.98
 #: Draws from parts whose sizes differ by less than this factor are not independent.
 _DISTINCT = 1.4
 #: Samples of the local optimisation and largest size of these, how many working thresholds from
@@ -105,9 +107,9 @@ def search(
 
     Rounds of draws on nested sets of the most reliable matches, on all that are ranked, and on what
     the best hypothesis so far leaves near its epipolar lines: a nearly right F has the right one's
-    inliers there. Each hypothesis is polished on all matches. The search ends when a second,
-    independent draw arrives at the winner's inliers, or after `ROUNDS` and a local optimisation of
-    the best hypothesis.
+    inliers there. Each hypothesis is polished on all matches. The draws end when a second,
+    independent one arrives at the best hypothesis's inliers, or after `ROUNDS`. Unless the two
+    are nearly the same, the best hypothesis is then optimised locally.
 
     Parameters
     ----------
@@ -176,9 +178,9 @@ def search(
         agreed = pool.agrees()
         if agreed:
             break
-    else:
-        if len(pool) == 0:
-            return None
+    if len(pool) == 0:
+        return None
+    if not pool.agrees(_CLOSE_AGREEMENT):
         pool.optimise()
         agreed = pool.agrees()
     F = pool.refined_best() if others is None else pool.before(others - centre).settled_best()
@@ -273,12 +275,9 @@ class _Pool:
         if size < 8:
             return
         keys = self._rng.random((_LOCAL_SAMPLES, len(near)))
-        F = eight_point(self._X[near[keys.argpartition(size, axis=1)[:, :size]]])
-        F = F[np.isfinite(F).all(axis=(1, 2))]  # nothing fits the copies of one match
-        if not len(F):
-            return
+        samples = near[keys.argpartition(size, axis=1)[:, :size]]
         part = self._frame.part(self.near_best(_LOCAL_REACH))
-        G = polish(part, part.enter(F), [_POLISH_WIDTH * self.working] * _LOCAL_STEPS)
+        G = polish(part, self._frame.fitted(samples), [_POLISH_WIDTH * self.working] * _LOCAL_STEPS)
         squared, votes = self._poll(G)
         best = [votes.argmax()]
         self._append(G[best], squared[best], votes[best], [0])
@@ -287,12 +286,13 @@ class _Pool:
         """Inliers of each hypothesis as ones, in a type that can be multiplied fast, (m, n)."""
         return (self._squared < self.working**2).astype(np.float32)
 
-    def agrees(self) -> bool:
+    def agrees(self, overlap: float = _AGREEMENT) -> bool:
         """Whether draws from two different parts have the best hypothesis's inliers."""
         if len(self) < 2:
             return False
         inliers = self._inliers()
-        sizes = self._sizes[_alike(inliers, inliers[self.best]) & (self._sizes > 0)]
+        alike = _alike(inliers, inliers[self.best], overlap)
+        sizes = self._sizes[alike & (self._sizes > 0)]
         return len(sizes) > 1 and bool(sizes.max() >= _DISTINCT * sizes.min())
 
     def refined_best(self) -> NDArray[np.float64]:
@@ -305,7 +305,7 @@ class _Pool:
         inliers = self._inliers()
         chosen: list[int] = []
         for i in np.argsort(-self.votes, kind="stable").tolist():
-            if not _alike(inliers[chosen], inliers[i]).any():
+            if not _alike(inliers[chosen], inliers[i], _AGREEMENT).any():
                 chosen.append(i)
             if len(chosen) == _FINALISTS:
                 break
@@ -327,10 +327,10 @@ class _Pool:
         return _refined(self._frame, step[0], self._reliable, self.threshold)
 
 
-def _alike(inliers: Floats, one: Floats) -> Bools:
+def _alike(inliers: Floats, one: Floats, overlap: float) -> Bools:
     """Which of some inlier sets (m, n) agree with another one (n,)."""
     common = inliers @ one
-    return np.asarray(common >= _AGREEMENT * (inliers.sum(axis=1) + one.sum() - common))
+    return np.asarray(common >= overlap * (inliers.sum(axis=1) + one.sum() - common))
 
 
 def _refined(frame: Frame, G: Floats, reliable: Ints, threshold: float) -> NDArray[np.float64]:

@@ -143,6 +143,11 @@ class Frame:
         """Fundamental matrices (m, 3, 3) of this frame, in pixels."""
         return np.asarray(self._second.T @ G @ self._first)
 
+    def fitted(self, samples: NDArray[np.intp]) -> Floats:
+        """Least squares for each sample of eight or more rows (m, k), not yet of rank 2."""
+        A = self.products.T[samples]
+        return np.linalg.svd(A, full_matrices=True)[2][:, 8].reshape(-1, 3, 3)
+
     def errors(self, G: Floats) -> tuple[Floats, Floats]:
         """Algebraic error and squared gradient norm of each match under each matrix, (m, n)."""
         lines2 = G[:, :2] @ self.homogeneous1

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from cv_densityf._consensus import eight_point_ransac, search
 from cv_densityf._engine import Robust, method_flag, method_name
 from cv_densityf._epipolar import FAR, inlier_mask, middle
-from cv_densityf._prefilter import contrast_support, paper_support
+from cv_densityf._prefilter import best, contrast_support, paper_support
 from cv_densityf._stopwatch import Stopwatch
 
 #: One line per estimate at level DEBUG.
@@ -73,8 +73,9 @@ class Estimate:
     timings : dict of str to float
         Milliseconds per stage.
     votes : tuple of float
-        The vote for each polished hypothesis, in the order of the draws; where no two draws agree,
-        then for those of the local optimisation. Of many matches, those of the part that searched.
+        The vote for each polished hypothesis, in the order of the draws; where no two draws agree
+        closely, then for that of the local optimisation. Of many matches, those of the part that
+        searched.
 
     See Also
     --------
@@ -167,8 +168,7 @@ def _estimate(
     if density == "paper":
         r, support = paper_support(Z, alpha, dc_percent)
     else:
-        ranked = _spread(Z, MAX_RANKED, np.random.default_rng(abs(seed)))
-        r, support = contrast_support(Z, trust, ranked)
+        r, support = contrast_support(Z, trust, _ranked(Z, trust, seed))
     reliability = np.full(n, np.nan)
     reliability[rows] = r
     kept = np.zeros(n, dtype=bool)
@@ -227,6 +227,20 @@ def _search_threshold(spread: float, robust: Robust, density: str) -> float:
     if density == "paper":  # th of its step 5
         return robust.threshold
     return min(max(own, robust.threshold / _LEEWAY), robust.threshold * _LEEWAY)
+
+
+def _ranked(
+    X: NDArray[np.float64], trust: NDArray[np.float64] | None, seed: int
+) -> NDArray[np.intp] | None:
+    """Rows whose density is looked at, of the half with the better scores; None for all."""
+    n = len(X)
+    if n <= MAX_RANKED:
+        return None
+    rng = np.random.default_rng(abs(seed))
+    if trust is None:
+        return _spread(X, MAX_RANKED, rng)
+    better = best(trust, max(n // 2, MAX_RANKED))
+    return better[_spread(X[better], MAX_RANKED, rng)]
 
 
 def _spread(X: NDArray[np.float64], size: int, rng: np.random.Generator) -> NDArray[np.intp]:

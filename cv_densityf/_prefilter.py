@@ -17,12 +17,17 @@ _KD_TREE: dict[str, bool | int | float | str] = {"algorithm": 4}
 _EXACT: dict[str, bool | int | float | str] = {"checks": -1}
 #: Squared distances beyond would not fit in float32.
 _FARTHEST = 1e18
+#: Of the caller's scores the worst part, one match in so many, is no witness for others.
+_WORST = 5
 #: Rows compared at a time, so that the comparison table stays in the cache.
 _CHUNK = 4096
 
 
 def density_contrast(
-    X: Floats, n_neighbors: int | None = None, rows: Ints | None = None
+    X: Floats,
+    n_neighbors: int | None = None,
+    rows: Ints | None = None,
+    among: Ints | None = None,
 ) -> NDArray[np.float64]:
     """How much denser the matches lie around each match in 4-D than chance would put them.
 
@@ -41,6 +46,8 @@ def density_contrast(
         Largest neighbourhood, `N_NEIGHBORS` by default.
     rows : array of int, shape (m,), optional
         The matches to tell it of, by default all.
+    among : array of int, shape (l,), optional
+        The matches that count as neighbours, l >= 2, by default all.
 
     Returns
     -------
@@ -48,14 +55,19 @@ def density_contrast(
         Sum over the shared neighbours, 0 for a match that shares none.
     """
     n = len(X)
-    k = min(n_neighbors or N_NEIGHBORS, n - 1) + 1
+    among = np.arange(n) if among is None else among
+    k = min(n_neighbors or N_NEIGHBORS, len(among) - 1) + 1
     # In float32 what matters is how far the points are from each other, not from the origin.
     Y = X - np.partition(X, n // 2, axis=0)[n // 2]
     Y = Y.clip(-_FARTHEST, _FARTHEST).astype(np.float32)
     halves = [np.ascontiguousarray(half) for half in (Y[:, :2], Y[:, 2:])]
-    indices = [cv2.flann.Index(half, _KD_TREE) for half in halves]
-    # A match is its own first neighbour, at place 0, or a copy of it is.
-    weight = 1.0 / np.maximum(np.arange(k), 1)
+    indices = [cv2.flann.Index(half[among], _KD_TREE) for half in halves]
+    # A match among them is its own first neighbour, at place 0, or a copy of it is. An outsider
+    # sees one neighbour more, which does not count.
+    outside = np.ones(n, dtype=np.intp)
+    outside[among] = 0
+    weight = 1.0 / np.maximum(np.arange(k + 1), 1)
+    weight[k] = 0.0
     rows = np.arange(n) if rows is None else rows
     contrast = np.empty(len(rows))
     for start in range(0, len(rows), _CHUNK):
@@ -67,9 +79,10 @@ def density_contrast(
         shared = np.flatnonzero(near1[:, :, None] == near2[:, None, :])
         row, places = np.divmod(shared, k * k)
         place1, place2 = np.divmod(places, k)
+        rank = np.maximum(place1, place2) + outside[rows[chunk]][row]
         # Neither itself nor a copy, such as SIFT's second orientation, says anything for a match.
         other = (squared1[row, place1] > 0) | (squared2[row, place2] > 0)
-        counts = weight[np.maximum(place1, place2)] * other
+        counts = weight[rank] * other
         contrast[chunk] = np.bincount(row, counts, minlength=len(near1))
     return contrast
 
@@ -86,20 +99,29 @@ def with_scores(reliability: Floats, scores: Floats) -> NDArray[np.float64]:
     return ranks(2 * reliability + ranks(scores))
 
 
+def best(scores: Floats, size: int) -> Ints:
+    """Rows of the ``size`` best scores, and of those as good as the last, in rising order."""
+    worse = len(scores) - size
+    return np.flatnonzero(scores >= np.partition(scores, worse)[worse])
+
+
 def contrast_support(
     X: Floats, scores: Floats | None = None, rows: Ints | None = None
 ) -> tuple[NDArray[np.float64], Bools]:
     """Rank in [0, 1] of each match's density contrast, 1 for the most reliable; the denser half.
 
-    With ``scores`` (n,), higher for more trusted matches, both count: see `with_scores`. With
-    ``rows`` (m,) only these are looked at, among all: the others have a reliability of NaN.
+    With ``scores`` (n,), higher for more trusted matches, both count: see `with_scores`; and the
+    worst fifth by score does not count as neighbours. With ``rows`` (m,) only these are looked at,
+    among all: the others have a reliability of NaN.
     """
+    n = len(X)
     if rows is None:
-        rows = np.arange(len(X))
-    ranked = ranks(density_contrast(X, rows=rows))
+        rows = np.arange(n)
+    among = None if scores is None else best(scores, n - n // _WORST)
+    ranked = ranks(density_contrast(X, rows=rows, among=among))
     if scores is not None:
         ranked = with_scores(ranked, scores[rows])
-    reliability = np.full(len(X), np.nan)
+    reliability = np.full(n, np.nan)
     reliability[rows] = ranked
     return reliability, reliability >= 0.5
 

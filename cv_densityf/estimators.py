@@ -328,14 +328,14 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
             else _check_sample_weight(sample_weight, matches, dtype=np.float64)
         )
         reliability: NDArray[np.floating]
-        if n < MIN_FILTERED:
-            reliability, support = np.ones(n), np.ones(n, dtype=bool)
-        elif self.rule == "contrast":
-            reliability, support = contrast_support(checked_points(matches))
+        if n >= MIN_FILTERED and self.rule == "contrast":
+            reliability, support = contrast_support(checked_points(matches), weight)
         else:
-            reliability, support = paper_support(matches, self.alpha, self.dc_percent)
-        if weight is not None:
-            reliability = with_scores(ranks(reliability), weight)
+            reliability, support = np.ones(n), np.ones(n, dtype=bool)
+            if n >= MIN_FILTERED:
+                reliability, support = paper_support(matches, self.alpha, self.dc_percent)
+            if weight is not None:
+                reliability = with_scores(ranks(reliability), weight)
         if weight is not None or self.keep is not None:
             n_kept = round(self.keep * n) if self.keep is not None else np.count_nonzero(support)
             support = np.zeros(n, dtype=bool)

@@ -370,7 +370,7 @@ def test_larger_parts_get_fewer_iterations(monkeypatch):
 def test_the_noise_narrows_later_draws(monkeypatch, noise, threshold, low, high):
     """To four standard deviations, down to a quarter of the threshold, and never beyond it."""
     seen = spied_draws(monkeypatch, _consensus.draw)
-    monkeypatch.setattr(_Pool, "agrees", lambda pool: False)
+    monkeypatch.setattr(_Pool, "agrees", lambda *_: False)
     find(scene_of(0, inlier_ratio=0.6, noise=noise).X, threshold=threshold)
     first, second, *later = [call[1] for call in seen]
     assert first == second == threshold
@@ -381,7 +381,7 @@ def test_the_noise_narrows_later_draws(monkeypatch, noise, threshold, low, high)
 def test_the_noise_is_told_by_the_reliable_half(monkeypatch):
     """Of which the first thirty matches are more exact, while the other half is less."""
     seen = spied_draws(monkeypatch, _consensus.draw)
-    monkeypatch.setattr(_Pool, "agrees", lambda pool: False)
+    monkeypatch.setattr(_Pool, "agrees", lambda *_: False)
     row = np.arange(600)
     noise = np.select([row < 30, row < 300], [0.8, 1.6], 4.0)
     X = true_matches(0, n=600) + np.random.default_rng(0).normal(size=(600, 4)) * noise[:, None]
@@ -408,7 +408,7 @@ def test_matches_near_the_best_are_drawn_from_however_unreliable(monkeypatch):
     unreliable = scene.inliers & (np.arange(600) % 2 == 1)
     reliability = 0.5 + 0.4 * (scene.inliers & ~unreliable) - 0.4 * unreliable + rank
     seen = spied_draws(monkeypatch, _consensus.draw)
-    monkeypatch.setattr(_Pool, "agrees", lambda pool: False)
+    monkeypatch.setattr(_Pool, "agrees", lambda *_: False)
     find(scene.X, reliability)
     X = (scene.X - scene.X.mean(axis=0)).astype(np.float32)
     row_of = {row.tobytes(): i for i, row in enumerate(X)}
@@ -442,7 +442,7 @@ def test_the_unit_of_length_does_not_matter_to_what_is_made_of_the_draws(factor,
         return eight_point(points[None, rows].astype(np.float64))[0]
 
     monkeypatch.setattr(_consensus, "draw", fit)
-    monkeypatch.setattr(_Pool, "agrees", lambda pool: False)
+    monkeypatch.setattr(_Pool, "agrees", lambda *_: False)
     X = scene_of(seed, inlier_ratio=0.6).X
     reliability = contrast_support(X[:300])[0]
     zoom = np.diag([factor, factor, 1.0])
@@ -457,12 +457,15 @@ def test_the_unit_of_length_does_not_matter_to_what_is_made_of_the_draws(factor,
         )
 
 
-def test_where_no_two_draws_agree_the_best_is_optimised(monkeypatch):
-    X = scene_of(0, inlier_ratio=0.6).X
-    assert len(find(X).votes) == find(X).n_draws
-    monkeypatch.setattr(_Pool, "agrees", lambda pool: False)
-    found = find(X)
-    assert len(found.votes) == found.n_draws + 1
+def test_where_no_two_draws_agree_closely_the_best_is_optimised(monkeypatch):
+    X = scene_of(0, inlier_ratio=0.9, noise=0.2).X
+    assert find(X).n_draws == len(find(X).votes) == 2
+    for closest, n_draws in ((0.98, 2), (0.93, 10)):
+        # Of agreement up to this: by less than ends the search, and by less than ends the draws.
+        monkeypatch.setattr(_Pool, "agrees", lambda pool, least=0.93, most=closest: least < most)
+        found = find(X)
+        assert found.n_draws == n_draws
+        assert len(found.votes) == n_draws + 1
 
 
 def test_local_optimisation_is_no_second_opinion():
@@ -564,13 +567,17 @@ def test_agreement_is_of_inliers_from_parts_of_other_sizes(common, more, sizes, 
     residuals[1, 100 - common : 100 + more] = 2.9
     pool._append(np.zeros((2, 3, 3)), residuals**2, np.array([2.0, 1.0]), sizes)
     assert pool.agrees() == agree
+    overlap = common / (100 + more)
+    if agree:
+        assert pool.agrees(overlap - 0.001)
+    assert not pool.agrees(overlap + 0.001)
 
 
 def test_the_reason_tells_of_agreement(monkeypatch):
     X = scene_of(0, inlier_ratio=0.9, noise=0.2).X
     found = find(X)
     assert found.reason.endswith(f" {found.n_draws} draws, found again by another")
-    monkeypatch.setattr(_Pool, "agrees", lambda pool: False)
+    monkeypatch.setattr(_Pool, "agrees", lambda *_: False)
     assert find(X).reason.endswith(" draws")
 
 
@@ -589,7 +596,7 @@ def test_the_watch_tells_draws_from_the_rest(monkeypatch):
     monkeypatch.setattr(_consensus, "draw", lasting(1, _consensus.draw))
     monkeypatch.setattr(_consensus, "polish", lasting(1000, _consensus.polish))
     monkeypatch.setattr(_stopwatch, "perf_counter", lambda: now)
-    monkeypatch.setattr(_Pool, "agrees", lambda pool: False)
+    monkeypatch.setattr(_Pool, "agrees", lambda *_: False)
     watch = Stopwatch()
     X = scene_of(0).X
     found = search(X, contrast_support(X)[0], seed=0, watch=watch, **ASKED)

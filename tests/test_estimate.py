@@ -469,6 +469,21 @@ def test_a_searched_part_is_told_by_the_reliability():
     assert not np.array_equal(unseen, np.isnan(other.reliability))
 
 
+@pytest.mark.parametrize(("n", "n_better"), [(1_200, 1_000), (4_000, 2_000)])
+def test_of_many_matches_those_with_the_better_scores_are_looked_at(n, n_better):
+    X = scene_of(0, n, 0.5).X
+    scores = np.random.default_rng(0).uniform(size=n)
+    seen = [
+        np.flatnonzero(~np.isnan(estimate(X, scores=scores, random_state=seed).reliability))
+        for seed in range(2)
+    ]
+    better = np.argsort(-scores)[:n_better]
+    for rows in seen:
+        assert len(rows) == 1_000
+        assert np.isin(rows, better).all()
+    assert np.array_equal(*seen) == (n_better == 1_000)
+
+
 def test_a_part_is_spread_as_all_are():
     """Every cell of the first image has its share in the part, but for a match at either end."""
     X = scene_of(0, 20_000, 0.4).X

@@ -12,6 +12,7 @@ from scipy.stats import rankdata
 from cv_densityf import _prefilter
 from cv_densityf._prefilter import (
     N_NEIGHBORS,
+    best,
     contrast_support,
     density_contrast,
     paper_support,
@@ -33,12 +34,13 @@ def auc(values, positive):
     return (rank - n * (n + 1) / 2) / (n * m)
 
 
-def contrast_by_definition(X, k):
+def contrast_by_definition(X, k, among=None):
     """Each neighbour in both images counts 1 / its place in the list where it stands later."""
     n = len(X)
+    among = range(n) if among is None else among
     contrast = np.zeros(n)
     for i in range(n):
-        others = [j for j in range(n) if j != i]
+        others = [j for j in among if j != i]
         places = []
         for Y in (X[:, :2], X[:, 2:]):
             near = sorted(others, key=lambda j, Y=Y: np.hypot(*(Y[j] - Y[i])))[:k]
@@ -56,6 +58,18 @@ def test_contrast_is_the_definition(n, k):
     np.testing.assert_allclose(density_contrast(X, k), expected, rtol=1e-12)
 
 
+def test_only_those_among_count_as_neighbours():
+    """Outsiders have as many as the others, although they do not find themselves there."""
+    X = scene_of(6, 90).X
+    among = np.random.default_rng(0).permutation(90)[:60]
+    for k in (1, 8, 59):
+        np.testing.assert_allclose(
+            density_contrast(X, k, among=among),
+            contrast_by_definition(X, k, among),
+            rtol=1e-12,
+        )
+
+
 @pytest.mark.parametrize("columns", [slice(0, 2), slice(2, 4)])
 def test_contrast_is_the_definition_where_two_matches_share_a_point(columns):
     """As a keypoint with two orientations may: neither is then sure to stand first in its list."""
@@ -68,7 +82,7 @@ def test_contrast_is_the_definition_where_two_matches_share_a_point(columns):
     )
 
 
-def test_contrast_looks_at_ten_neighbours_unless_told():
+def test_contrast_looks_at_so_many_neighbours_unless_told():
     X = scene_of(0, 60).X
     np.testing.assert_array_equal(density_contrast(X), density_contrast(X, N_NEIGHBORS))
 
@@ -96,9 +110,10 @@ def test_rows_that_are_not_looked_at_are_neither_reliable_nor_kept():
     assert np.isnan(reliability[others]).all()
     assert not kept[others].any()
     scores = np.random.default_rng(0).uniform(size=400)
+    among = np.argsort(scores)[80:]  # but the worst fifth
     np.testing.assert_array_equal(
         contrast_support(X, scores, rows)[0][rows],
-        ranks(2 * ranks(density_contrast(X)[rows]) + ranks(scores[rows])),
+        ranks(2 * ranks(density_contrast(X, rows=rows, among=among)) + ranks(scores[rows])),
     )
 
 
@@ -211,10 +226,22 @@ def test_a_better_score_raises_the_reliability_of_its_match():
         raised[row] = 2.0
         after = contrast_support(scene.X, raised)[0]
         assert after[row] > before[row]
-        # The others keep their order.
+        # The others keep their order, but for those next to the one that is no witness any more.
         rest = np.arange(200) != row
         moved = np.abs(ranks(after[rest]) - ranks(before[rest]))
-        assert moved.max() < 0.02
+        assert np.mean(moved < 0.02) > 0.8
+
+
+def test_equal_scores_say_nothing():
+    X = scene_of(0, 200).X
+    np.testing.assert_array_equal(contrast_support(X, np.ones(200))[0], contrast_support(X)[0])
+
+
+def test_the_best_scores_are_found_with_those_as_good():
+    scores = np.array([3.0, 1.0, 2.0, 2.0, -np.inf, 5.0])
+    assert best(scores, 2).tolist() == [0, 5]
+    assert best(scores, 3).tolist() == [0, 2, 3, 5]
+    assert best(scores, 6).tolist() == [0, 1, 2, 3, 4, 5]
 
 
 def test_only_the_order_of_scores_counts():
