@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,9 +83,10 @@ _BATCH = 64
 
 @dataclass(frozen=True, slots=True)
 class Consensus:
-    """The hypothesis that won, and how."""
+    """The hypothesis that won, the weight that each match's vote had, and how it came about."""
 
     F: NDArray[np.float64]
+    reliability: NDArray[np.float64]
     votes: tuple[float, ...]
     n_draws: int
     reason: str
@@ -92,7 +94,7 @@ class Consensus:
 
 def search(
     X: Floats,
-    reliability: Floats,
+    rankings: Iterable[NDArray[np.float64]],
     *,
     threshold: float,
     confidence: float,
@@ -108,16 +110,17 @@ def search(
     Rounds of draws on nested sets of the most reliable matches, on all that are ranked, and on what
     the best hypothesis so far leaves near its epipolar lines: a nearly right F has the right one's
     inliers there. Each hypothesis is polished on all matches. The draws end when a second,
-    independent one arrives at the best hypothesis's inliers, or after `ROUNDS`. Unless the two
-    are nearly the same, the best hypothesis is then optimised locally.
+    independent one arrives at the best hypothesis's inliers, or after `ROUNDS` on each ranking.
+    Unless the two are nearly the same, the best hypothesis is then optimised locally.
 
     Parameters
     ----------
     X : array, shape (n, 4)
         Finite matches.
-    reliability : array, shape (n,)
-        Weight of each match's vote, in [0, 1]; also the order of the draws. NaN where it is not
-        known: such a match is in no draw by density and has half a vote.
+    rankings : iterable of array, shape (n,)
+        Reliability of each match: the weight of its vote, in [0, 1], and its place in the order of
+        the draws. NaN where it is not known: such a match is in no draw by density and has half a
+        vote. Where no two draws agree the search begins anew with the next one.
     threshold : float
         Of the draws, pixels. The mask has one of its own, the caller's.
     confidence, max_iters
@@ -143,38 +146,14 @@ def search(
     # Far from the origin the float32 that cv2 draws with would eat the pixels.
     centre, spread = about or middle(X)
     X = X - centre
-    order = np.argsort(-reliability, kind="stable")[: np.count_nonzero(reliability >= 0.0)]
-    n_ranked = len(order)
-    points = X[order].astype(np.float32)
-    reliable = order[: max(MIN_DRAW, n_ranked // 2)]
     frame = Frame(X, (np.zeros(4), spread))
     rng = np.random.default_rng(abs(seed))
-    pool = _Pool(X, np.nan_to_num(reliability, nan=0.5), reliable, threshold, rng, frame)
     n_draws = 0
-    for fractions in ROUNDS:
-        found, sizes = [], []
-        for fraction in fractions:
-            by_score = fraction == BY_SCORE
-            if by_score and scores is not None:
-                part = X[np.argsort(-scores, kind="stable")].astype(np.float32)
-            elif fraction == NEAR and len(pool):
-                part = points[pool.near_best(_NEAR_WIDTH)[order]]
-            elif fraction > 0.0:
-                part = points[: max(MIN_DRAW, int(n_ranked * fraction))]
-            else:
-                continue
-            share = 0.25 if by_score else max(len(part) / n_ranked, 0.25)
-            iters = min(max_iters, int(MAX_DRAW_ITERS * np.sqrt(0.25 / share)))
-            F = draw(part, pool.working, confidence, iters, seed + n_draws, best_first=by_score)
-            n_draws += 1
-            if F is not None:
-                found.append(F)
-                sizes.append(len(part))
-        watch.lap("draws")
-        if found:
-            F = np.stack(found)
-            pool.add(F if len(pool) else pool.adapted(F), sizes)
-        watch.lap("polish")
+    for reliability in rankings:
+        order = np.argsort(-reliability, kind="stable")[: np.count_nonzero(reliability >= 0.0)]
+        reliable = order[: max(MIN_DRAW, len(order) // 2)]
+        pool = _Pool(X, np.nan_to_num(reliability, nan=0.5), reliable, threshold, rng, frame)
+        n_draws += _fill(pool, X, order, scores, confidence, max_iters, seed + n_draws, watch)
         agreed = pool.agrees()
         if agreed:
             break
@@ -188,7 +167,49 @@ def search(
     watch.lap("polish")
     again = ", found again by another" if agreed else ""
     reason = f"the hypothesis with the most votes of {n_draws} draws{again}"
-    return Consensus(F=F, votes=tuple(pool.votes.tolist()), n_draws=n_draws, reason=reason)
+    return Consensus(F, reliability, tuple(pool.votes.tolist()), n_draws, reason)
+
+
+def _fill(
+    pool: _Pool,
+    X: Floats,
+    order: Ints,
+    scores: Floats | None,
+    confidence: float,
+    max_iters: int,
+    seed: int,
+    watch: Stopwatch,
+) -> int:
+    """Make rounds of draws until two of them agree, or to the last; count the draws."""
+    points = X[order].astype(np.float32)
+    n_draws = 0
+    for fractions in ROUNDS:
+        found, sizes = [], []
+        for fraction in fractions:
+            by_score = fraction == BY_SCORE
+            if by_score and scores is not None:
+                part = X[np.argsort(-scores, kind="stable")].astype(np.float32)
+            elif fraction == NEAR and len(pool):
+                part = points[pool.near_best(_NEAR_WIDTH)[order]]
+            elif fraction > 0.0:
+                part = points[: max(MIN_DRAW, int(len(order) * fraction))]
+            else:
+                continue
+            share = 0.25 if by_score else max(len(part) / len(order), 0.25)
+            iters = min(max_iters, int(MAX_DRAW_ITERS * np.sqrt(0.25 / share)))
+            F = draw(part, pool.working, confidence, iters, seed + n_draws, best_first=by_score)
+            n_draws += 1
+            if F is not None:
+                found.append(F)
+                sizes.append(len(part))
+        watch.lap("draws")
+        if found:
+            F = np.stack(found)
+            pool.add(F if len(pool) else pool.adapted(F), sizes)
+        watch.lap("polish")
+        if pool.agrees():
+            break
+    return n_draws
 
 
 class _Pool:
@@ -445,7 +466,7 @@ def eight_point_ransac(
     if best is None:
         return None
     reason = f"{most} of the {n} matches that passed the paper's rule agree"
-    return Consensus(F=best, votes=(float(most),), n_draws=drawn, reason=reason)
+    return Consensus(best, np.ones(n), (float(most),), drawn, reason)
 
 
 def _samples_needed(inlier_ratio: float, confidence: float) -> float:

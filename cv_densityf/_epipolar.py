@@ -263,9 +263,7 @@ def eight_point(samples: Floats) -> NDArray[np.float64]:
         points.append(Z)
     A = (points[1][..., :, None] * points[0][..., None, :]).reshape(m, k, 9)
     G = np.linalg.svd(A, full_matrices=True)[2][:, 8].reshape(m, 3, 3)
-    U, S, Vt = np.linalg.svd(G)
-    S[:, 2] = 0.0
-    F = transforms[1].transpose(0, 2, 1) @ ((U * S[:, None]) @ Vt) @ transforms[0]
+    F = transforms[1].transpose(0, 2, 1) @ _rank_two(G)[0] @ transforms[0]
     return np.asarray(F / np.linalg.norm(F, axis=(1, 2), keepdims=True))
 
 

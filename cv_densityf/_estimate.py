@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from numbers import Integral, Real
 from typing import Any, Literal, get_args
@@ -30,7 +30,8 @@ MIN_FILTERED = 15
 MAX_SEARCHED = 5_000
 #: They do help to choose and to measure it, up to what memory should bear.
 MAX_REFINED = 100_000
-#: Of as many of those that search the density is looked at, and hypotheses are drawn.
+#: Of as many of those that search the density is looked at, and hypotheses are drawn; of all where
+#: no two of these agree.
 MAX_RANKED = 1_000
 #: A part is spread over cells of the first image, and in each of them over cells of the second:
 #: this many to the longer side.
@@ -61,7 +62,7 @@ class Estimate:
         Inliers by the method's own rule.
     kept : array, shape (n,), bool
         The dense part: matches the density rule holds reliable. Of more than a thousand it looks at
-        a thousand, spread over both images.
+        a thousand, spread over both images, and at all where these lead to no agreement.
     reliability : array, shape (n,), float64
         From 0 (isolated) to 1 (densest); NaN for matches whose density was not looked at.
     n_draws : int
@@ -165,15 +166,6 @@ def _estimate(
             "cv2's own call, since all points of an image are nearly on a line",
         )
     trust = None if scores is None else scores[rows]
-    if density == "paper":
-        r, support = paper_support(Z, alpha, dc_percent)
-    else:
-        r, support = contrast_support(Z, trust, _ranked(Z, trust, seed))
-    reliability = np.full(n, np.nan)
-    reliability[rows] = r
-    kept = np.zeros(n, dtype=bool)
-    kept[rows] = support
-    watch.lap("density")
     about = middle(Z)
     asked: dict[str, Any] = {
         "threshold": _search_threshold(about[1], robust, density),
@@ -184,9 +176,12 @@ def _estimate(
     with np.errstate(all="ignore"):
         try:
             if density == "paper":
+                r, support = paper_support(Z, alpha, dc_percent)
+                watch.lap("density")
                 found = eight_point_ransac(Z[support], **asked)
                 watch.lap("draws")
             else:
+                rankings = _rankings(Z, trust, seed, watch)
                 if trust is None and robust.best_first:
                     trust = -rows.astype(np.float64)
                 others = None
@@ -194,13 +189,21 @@ def _estimate(
                     searched = np.zeros(n, dtype=bool)
                     searched[rows] = True
                     others = X[heard[~searched[heard]]]
-                found = search(Z, r, watch=watch, about=about, scores=trust, others=others, **asked)
+                found = search(
+                    Z, rankings, watch=watch, about=about, scores=trust, others=others, **asked
+                )
+                if found is not None:
+                    r, support = found.reliability, found.reliability >= 0.5
         except np.linalg.LinAlgError:
             found = None
     if found is None:
         return _plain(
             X, finite, robust, watch, "cv2's own call, since no draw on the dense part held"
         )
+    reliability = np.full(n, np.nan)
+    reliability[rows] = r
+    kept = np.zeros(n, dtype=bool)
+    kept[rows] = support
     mask = inlier_mask(found.F, X, robust.rule, robust.threshold)
     watch.lap("mask")
     if np.count_nonzero(mask) < _MINIMAL:
@@ -229,18 +232,20 @@ def _search_threshold(spread: float, robust: Robust, density: str) -> float:
     return min(max(own, robust.threshold / _LEEWAY), robust.threshold * _LEEWAY)
 
 
-def _ranked(
-    X: NDArray[np.float64], trust: NDArray[np.float64] | None, seed: int
-) -> NDArray[np.intp] | None:
-    """Rows whose density is looked at, of the half with the better scores; None for all."""
+def _rankings(
+    X: NDArray[np.float64], trust: NDArray[np.float64] | None, seed: int, watch: Stopwatch
+) -> Iterator[NDArray[np.float64]]:
+    """Reliability of a well spread part, from the half with the better scores; then of all."""
     n = len(X)
-    if n <= MAX_RANKED:
-        return None
-    rng = np.random.default_rng(abs(seed))
-    if trust is None:
-        return _spread(X, MAX_RANKED, rng)
-    better = best(trust, max(n // 2, MAX_RANKED))
-    return better[_spread(X[better], MAX_RANKED, rng)]
+    if n > MAX_RANKED:
+        better = np.arange(n) if trust is None else best(trust, max(n // 2, MAX_RANKED))
+        rows = better[_spread(X[better], MAX_RANKED, np.random.default_rng(abs(seed)))]
+        reliability, _ = contrast_support(X, trust, rows)
+        watch.lap("density")
+        yield reliability
+    reliability, _ = contrast_support(X, trust)
+    watch.lap("density")
+    yield reliability
 
 
 def _spread(X: NDArray[np.float64], size: int, rng: np.random.Generator) -> NDArray[np.intp]:

@@ -36,7 +36,7 @@ ASKED = {"threshold": 1.0, "confidence": 0.999, "max_iters": 5000}
 def find(X, reliability=None, *, seed=0, **asked):
     if reliability is None:
         reliability = contrast_support(X)[0]
-    return search(X, reliability, seed=seed, watch=Stopwatch(), **{**ASKED, **asked})
+    return search(X, [reliability], seed=seed, watch=Stopwatch(), **{**ASKED, **asked})
 
 
 def true_matches(seed, n=400):
@@ -573,6 +573,30 @@ def test_agreement_is_of_inliers_from_parts_of_other_sizes(common, more, sizes, 
     assert not pool.agrees(overlap + 0.001)
 
 
+def test_the_next_ranking_is_asked_for_where_no_two_draws_agree(monkeypatch):
+    scene = scene_of(0, inlier_ratio=0.6, noise=0.2)
+    told = 0.5 + 0.5 * scene.inliers
+    misled = np.where(scene.inliers, np.nan, 1.0)
+    asked = []
+
+    def rankings(*tried):
+        for reliability in tried:
+            asked.append(reliability)
+            yield reliability
+
+    options = {"seed": 0, "watch": Stopwatch(), **ASKED}
+    easy = search(scene.X, rankings(told, misled), **options)
+    assert len(asked) == 1
+    found = search(scene.X, rankings(misled, told), **options)
+    assert len(asked) == 3
+    assert found.n_draws > 10
+    np.testing.assert_array_equal(found.reliability, told)
+    np.testing.assert_array_equal(easy.reliability, told)
+    assert sampson_distance(found.F, true_matches(0)).mean() < 0.2
+    alone = search(scene.X, [misled], **options)
+    assert sampson_distance(alone.F, true_matches(0)).mean() > 1.0
+
+
 def test_the_reason_tells_of_agreement(monkeypatch):
     X = scene_of(0, inlier_ratio=0.9, noise=0.2).X
     found = find(X)
@@ -599,7 +623,7 @@ def test_the_watch_tells_draws_from_the_rest(monkeypatch):
     monkeypatch.setattr(_Pool, "agrees", lambda *_: False)
     watch = Stopwatch()
     X = scene_of(0).X
-    found = search(X, contrast_support(X)[0], seed=0, watch=watch, **ASKED)
+    found = search(X, [contrast_support(X)[0]], seed=0, watch=watch, **ASKED)
     draws = 1000 * found.n_draws
     assert watch.laps == {"draws": draws, "polish": 1000 * now - draws}
 

@@ -477,6 +477,8 @@ def test_of_many_matches_those_with_the_better_scores_are_looked_at(n, n_better)
         np.flatnonzero(~np.isnan(estimate(X, scores=scores, random_state=seed).reliability))
         for seed in range(2)
     ]
+    # Where two draws do not agree it is all, and so where the right ones are few.
+    assert not np.isnan(estimate(scene_of(0, n, 0.05).X, scores=scores).reliability).any()
     better = np.argsort(-scores)[:n_better]
     for rows in seen:
         assert len(rows) == 1_000
