@@ -299,10 +299,11 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
             Matches x, y, x', y', in pixels. ``rule="paper"`` takes any number of columns.
         y : ignored
         sample_weight : array_like, shape (n,), optional
-            Trust in each row, finite, higher is better; only its order counts. Rows are then
-            ordered by a sum in which the rank by density counts twice that by weight, as for the
-            ``scores`` of `cv_densityf.estimate_fundamental`; ``reliability_`` is the rank of that
-            sum, and as many rows are kept as without.
+            Trust in each row, finite, higher is better; only its order counts. It is used as the
+            ``scores`` of `cv_densityf.estimate_fundamental` are: rows are ordered by a sum of ranks
+            in which that by density counts four times, and by the contrast rule the worst fifth
+            does not count as neighbours. ``reliability_`` is the rank of that sum, and as many
+            rows are kept as without.
 
         Returns
         -------

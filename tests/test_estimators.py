@@ -452,11 +452,11 @@ def test_weights_count_as_scores_do_in_the_pipeline():
     np.testing.assert_array_equal(fitted.reliability_, estimate.reliability)
 
 
-def test_weight_counts_half_as_much_as_the_density_of_the_paper():
+def test_weight_counts_a_quarter_as_the_density_of_the_paper():
     rng = np.random.default_rng(3)
     X, weight = rng.normal(size=(40, 4)) * 100, rng.integers(0, 10, 40)
     by_density = DensityPeaksFilter("paper").fit(X).reliability_
-    by_both = 2 * rankdata(by_density) + rankdata(weight)
+    by_both = 4 * rankdata(by_density) + rankdata(weight)
     fitted = DensityPeaksFilter("paper").fit(X, sample_weight=weight)
     assert (np.diff(by_both[np.argsort(fitted.reliability_)]) >= 0).all()
 

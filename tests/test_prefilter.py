@@ -113,7 +113,7 @@ def test_rows_that_are_not_looked_at_are_neither_reliable_nor_kept():
     among = np.argsort(scores)[80:]  # but the worst fifth
     np.testing.assert_array_equal(
         contrast_support(X, scores, rows)[0][rows],
-        ranks(2 * ranks(density_contrast(X, rows=rows, among=among)) + ranks(scores[rows])),
+        ranks(4 * ranks(density_contrast(X, rows=rows, among=among)) + ranks(scores[rows])),
     )
 
 
