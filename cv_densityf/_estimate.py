@@ -166,6 +166,8 @@ def _estimate(
             "cv2's own call, since all points of an image are nearly on a line",
         )
     trust = None if scores is None else scores[rows]
+    if trust is None and robust.best_first:
+        trust = -rows.astype(np.float64)
     about = middle(Z)
     asked: dict[str, Any] = {
         "threshold": _search_threshold(about[1], robust, density),
@@ -182,8 +184,6 @@ def _estimate(
                 watch.lap("draws")
             else:
                 rankings = _rankings(Z, trust, seed, watch)
-                if trust is None and robust.best_first:
-                    trust = -rows.astype(np.float64)
                 others = None
                 if len(heard) > len(rows):
                     searched = np.zeros(n, dtype=bool)
