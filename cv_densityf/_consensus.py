@@ -31,12 +31,18 @@ NEAR = 0.0
 BY_SCORE = -1.0
 #: Shares of the ranked matches, most reliable first, that hypotheses are drawn from, round by
 #: round.
-ROUNDS = ((0.25, 0.5), (BY_SCORE, 0.75, NEAR), (0.125, 1.0), (0.5, NEAR), (0.25, 1.0))
+ROUNDS = (
+    (0.25, 0.5),
+    (BY_SCORE, 0.75, NEAR),
+    (0.125, BY_SCORE, 1.0),
+    (0.5, BY_SCORE, NEAR),
+    (0.25, 1.0),
+)
 _NEAR_WIDTH = 8.0
 #: Matches a draw gets at least: fewer crowd on too little of the image to fix F.
 MIN_DRAW = 30
-#: cv2's iterations in one draw by score or from a quarter of the ranked matches, and less from
-#: larger, less pure parts. More find no better F; several short draws do.
+#: cv2's iterations in one draw from a quarter of the ranked matches, and less from larger, less
+#: pure parts. More find no better F; several short draws do.
 MAX_DRAW_ITERS = 1000
 #: Two hypotheses agree when their inlier sets have this intersection over union; then there are no
 #: more draws. If it is less than the second, local optimisation has something to gain.
@@ -132,7 +138,7 @@ def search(
     about : (array, float), optional
         What `middle` says of X, if it is known.
     scores : array, shape (n,), optional
-        The caller's trust in each match: one more draw, in the second round, takes its samples in
+        The caller's trust in each match: one more draw in three of the rounds takes its samples in
         this order, whatever the density says.
     others : array, shape (k, 4), optional
         Matches that are not searched: with the rest they vote on the best hypotheses, and polish
@@ -195,7 +201,7 @@ def _fill(
                 part = points[: max(MIN_DRAW, int(len(order) * fraction))]
             else:
                 continue
-            share = 0.25 if by_score else max(len(part) / len(order), 0.25)
+            share = max(len(part) / len(order), 0.25)
             iters = min(max_iters, int(MAX_DRAW_ITERS * np.sqrt(0.25 / share)))
             F = draw(part, pool.working, confidence, iters, seed + n_draws, best_first=by_score)
             n_draws += 1
