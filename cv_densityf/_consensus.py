@@ -89,7 +89,7 @@ _BATCH = 64
 
 @dataclass(frozen=True, slots=True)
 class Consensus:
-    """The hypothesis that won, the weight that each match's vote had, and how it came about."""
+    """The hypothesis that won, the ranking it was found with, and how it came about."""
 
     F: NDArray[np.float64]
     reliability: NDArray[np.float64]
@@ -201,7 +201,7 @@ def _fill(
                 part = points[: max(MIN_DRAW, int(len(order) * fraction))]
             else:
                 continue
-            share = max(len(part) / len(order), 0.25)
+            share = min(max(len(part) / len(order), 0.25), 1.0)
             iters = min(max_iters, int(MAX_DRAW_ITERS * np.sqrt(0.25 / share)))
             F = draw(part, pool.working, confidence, iters, seed + n_draws, best_first=by_score)
             n_draws += 1

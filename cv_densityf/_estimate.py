@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from cv_densityf._consensus import eight_point_ransac, search
 from cv_densityf._engine import Robust, method_flag, method_name
 from cv_densityf._epipolar import FAR, inlier_mask, middle
-from cv_densityf._prefilter import best, contrast_support, paper_support
+from cv_densityf._prefilter import best_scored, contrast_support, paper_support
 from cv_densityf._stopwatch import Stopwatch
 
 #: One line per estimate at level DEBUG.
@@ -74,9 +74,9 @@ class Estimate:
     timings : dict of str to float
         Milliseconds per stage.
     votes : tuple of float
-        The vote for each polished hypothesis, in the order of the draws; where no two draws agree
-        closely, then for that of the local optimisation. Of many matches, those of the part that
-        searched.
+        The vote for each polished hypothesis of the last search, in the order of the draws; where
+        no two draws agree closely, then for that of the local optimisation. Of many matches, those
+        of the part that searched.
 
     See Also
     --------
@@ -235,10 +235,10 @@ def _search_threshold(spread: float, robust: Robust, density: str) -> float:
 def _rankings(
     X: NDArray[np.float64], trust: NDArray[np.float64] | None, seed: int, watch: Stopwatch
 ) -> Iterator[NDArray[np.float64]]:
-    """Reliability of a well spread part, from the half with the better scores; then of all."""
+    """Reliability of a part, well spread and from the better half by score; then of all."""
     n = len(X)
     if n > MAX_RANKED:
-        better = np.arange(n) if trust is None else best(trust, max(n // 2, MAX_RANKED))
+        better = np.arange(n) if trust is None else best_scored(trust, max(n // 2, MAX_RANKED))
         rows = better[_spread(X[better], MAX_RANKED, np.random.default_rng(abs(seed)))]
         reliability, _ = contrast_support(X, trust, rows)
         watch.lap("density")

@@ -99,7 +99,7 @@ def with_scores(reliability: Floats, scores: Floats) -> NDArray[np.float64]:
     return ranks(4 * reliability + ranks(scores))
 
 
-def best(scores: Floats, size: int) -> Ints:
+def best_scored(scores: Floats, size: int) -> Ints:
     """Rows of the ``size`` best scores, and of those as good as the last, in rising order."""
     worse = len(scores) - size
     return np.flatnonzero(scores >= np.partition(scores, worse)[worse])
@@ -117,7 +117,7 @@ def contrast_support(
     n = len(X)
     if rows is None:
         rows = np.arange(n)
-    among = None if scores is None else best(scores, n - n // _WORST)
+    among = None if scores is None else best_scored(scores, n - n // _WORST)
     ranked = ranks(density_contrast(X, rows=rows, among=among))
     if scores is not None:
         ranked = with_scores(ranked, scores[rows])

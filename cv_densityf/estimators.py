@@ -302,8 +302,8 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
             Trust in each row, finite, higher is better; only its order counts. It is used as the
             ``scores`` of `cv_densityf.estimate_fundamental` are: rows are ordered by a sum of ranks
             in which that by density counts four times, and by the contrast rule the worst fifth
-            does not count as neighbours. ``reliability_`` is the rank of that sum, and as many
-            rows are kept as without.
+            does not count as neighbours. ``reliability_`` is the rank of that sum. The better half
+            is kept by the contrast rule, by the paper's as many rows as without.
 
         Returns
         -------

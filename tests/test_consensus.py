@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from cv_densityf import _consensus, _stopwatch
+from cv_densityf import _consensus, _engine, _stopwatch
 from cv_densityf._consensus import (
     _Ballot,
     _noise,
@@ -334,6 +334,15 @@ def test_scores_give_three_more_draws_in_their_order(monkeypatch):
     assert sum(best_first for *_, best_first in seen) == 3
 
 
+def test_a_draw_by_scores_has_the_iterations_of_one_from_all(monkeypatch):
+    """However few of the matches are ranked."""
+    X = scene_of(0).X
+    seen = spied_draws(monkeypatch)
+    reliability = np.where(np.arange(600) < 100, 1.0, np.nan)
+    find(X, reliability, scores=np.arange(600))
+    assert {max_iters for _, _, max_iters, best_first in seen if best_first} == {500}
+
+
 def test_equal_matches_keep_the_order_of_their_rows(monkeypatch):
     """Numpy's default sort would order them by what the processor can do."""
     seen = spied_draws(monkeypatch)
@@ -589,7 +598,15 @@ def test_the_next_ranking_is_asked_for_where_no_two_draws_agree(monkeypatch):
     options = {"seed": 0, "watch": Stopwatch(), **ASKED}
     easy = search(scene.X, rankings(told, misled), **options)
     assert len(asked) == 1
+    seeds = []
+
+    def draw(points, threshold, confidence, max_iters, seed, best_first=False):
+        seeds.append(seed)
+        return _engine.draw(points, threshold, confidence, max_iters, seed, best_first)
+
+    monkeypatch.setattr(_consensus, "draw", draw)
     found = search(scene.X, rankings(misled, told), **options)
+    assert len(seeds) == len(set(seeds)) == found.n_draws
     assert len(asked) == 3
     assert found.n_draws > 10
     np.testing.assert_array_equal(found.reliability, told)

@@ -22,6 +22,7 @@ from cv_densityf import (
 from cv_densityf._engine import METHODS, Robust, original
 from cv_densityf._epipolar import eight_point, inlier_mask, middle, sampson_distance
 from cv_densityf._estimate import _CELLS, MIN_FILTERED, _spread, run
+from cv_densityf._prefilter import contrast_support
 from cv_densityf.datasets import two_view_scene
 
 ROBUST = [name for name in METHODS if name not in ("7point", "8point")]
@@ -484,6 +485,18 @@ def test_of_many_matches_those_with_the_better_scores_are_looked_at(n, n_better)
         assert len(rows) == 1_000
         assert np.isin(rows, better).all()
     assert np.array_equal(*seen) == (n_better == 1_000)
+
+
+@pytest.mark.parametrize("n_nan", [0, 40])
+def test_the_order_of_prosac_is_that_of_scores(n_nan):
+    X = scene_of(3, 300, 0.3).X
+    X[:n_nan] = np.nan
+    in_order = estimate(X, method="usac_prosac")
+    assert_same(in_order, estimate(X, method="usac_default", scores=-np.arange(300)))
+    finite = X[n_nan:]
+    expected = contrast_support(finite, -np.arange(len(finite)))[0]
+    np.testing.assert_array_equal(in_order.reliability[n_nan:], expected)
+    assert not np.array_equal(expected, contrast_support(finite)[0])
 
 
 def test_a_part_is_spread_as_all_are():

@@ -12,7 +12,7 @@ from scipy.stats import rankdata
 from cv_densityf import _prefilter
 from cv_densityf._prefilter import (
     N_NEIGHBORS,
-    best,
+    best_scored,
     contrast_support,
     density_contrast,
     paper_support,
@@ -239,9 +239,9 @@ def test_equal_scores_say_nothing():
 
 def test_the_best_scores_are_found_with_those_as_good():
     scores = np.array([3.0, 1.0, 2.0, 2.0, -np.inf, 5.0])
-    assert best(scores, 2).tolist() == [0, 5]
-    assert best(scores, 3).tolist() == [0, 2, 3, 5]
-    assert best(scores, 6).tolist() == [0, 1, 2, 3, 4, 5]
+    assert best_scored(scores, 2).tolist() == [0, 5]
+    assert best_scored(scores, 3).tolist() == [0, 2, 3, 5]
+    assert best_scored(scores, 6).tolist() == [0, 1, 2, 3, 4, 5]
 
 
 def test_only_the_order_of_scores_counts():
