@@ -159,8 +159,8 @@ def search(
         order = np.argsort(-reliability, kind="stable")[: np.count_nonzero(reliability >= 0.0)]
         reliable = order[: max(MIN_DRAW, len(order) // 2)]
         pool = _Pool(X, np.nan_to_num(reliability, nan=0.5), reliable, threshold, rng, frame)
-        n_draws += _fill(pool, X, order, scores, confidence, max_iters, seed + n_draws, watch)
-        agreed = pool.agrees()
+        made, agreed = _fill(pool, X, order, scores, confidence, max_iters, seed + n_draws, watch)
+        n_draws += made
         if agreed:
             break
     if len(pool) == 0:
@@ -185,8 +185,8 @@ def _fill(
     max_iters: int,
     seed: int,
     watch: Stopwatch,
-) -> int:
-    """Make rounds of draws until two of them agree, or to the last; count the draws."""
+) -> tuple[int, bool]:
+    """Make rounds of draws until two of them agree; how many it took, and whether they do."""
     points = X[order].astype(np.float32)
     n_draws = 0
     for fractions in ROUNDS:
@@ -213,9 +213,10 @@ def _fill(
             F = np.stack(found)
             pool.add(F if len(pool) else pool.adapted(F), sizes)
         watch.lap("polish")
-        if pool.agrees():
+        agreed = pool.agrees()
+        if agreed:
             break
-    return n_draws
+    return n_draws, agreed
 
 
 class _Pool:

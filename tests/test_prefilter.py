@@ -221,15 +221,16 @@ def test_a_better_score_raises_the_reliability_of_its_match():
     scene = scene_of(0, 200)
     scores = np.random.default_rng(0).uniform(size=200)
     before = contrast_support(scene.X, scores)[0]
-    for row in (3, 50, 120):
+    # Among the better four fifths, so that the same ones bear witness before and after.
+    for row in np.argsort(scores)[[45, 100, 150]]:
         raised = scores.copy()
         raised[row] = 2.0
         after = contrast_support(scene.X, raised)[0]
         assert after[row] > before[row]
-        # The others keep their order, but for those next to the one that is no witness any more.
+        # The others keep their order.
         rest = np.arange(200) != row
         moved = np.abs(ranks(after[rest]) - ranks(before[rest]))
-        assert np.mean(moved < 0.02) > 0.8
+        assert moved.max() < 0.02
 
 
 def test_equal_scores_say_nothing():
