@@ -69,7 +69,7 @@ KINDS: dict[str, Kind] = {
 
 #: Numbers of matches, inlier ratios and noise (px) of each kind, unless asked otherwise.
 FULL_GRID = ((200, 500, 2000, 8000), (0.1, 0.15, 0.2, 0.3, 0.5, 0.8), (0.5, 1.0))
-SMALL_GRID = ((500, 2000), (0.3, 0.6), (0.5, 1.0))
+SMALL_GRID = ((500, 2000), (0.3, 0.6, 0.9), (0.5, 1.0))
 
 
 def scenes(

@@ -19,6 +19,7 @@ from cv_densityf._epipolar import (
     polish,
     shift,
 )
+from cv_densityf._parallax import plane_and_parallax
 from cv_densityf._stopwatch import Stopwatch
 
 Floats = NDArray[np.floating]
@@ -48,6 +49,13 @@ MAX_DRAW_ITERS = 1000
 #: more draws. If it is less than the second, local optimisation has something to gain.
 _AGREEMENT = 0.93
 _CLOSE_AGREEMENT = 0.98
+#: Where a plane is dominant, a hypothesis with this share of the inliers of the one with the most
+#: votes, and so many standard deviations of chance more off the plane, is the better one: these fix
+#: F, and are often sparse and of little reliability.
+_CONTAINED = 0.9
+_SIGNIFICANT = 2.0
+#: Working thresholds within which a match is on a plane.
+_PLANE_WIDTH = 2.0
 #: Draws from parts whose sizes differ by less than this factor are not independent.
 _DISTINCT = 1.4
 #: Samples of the local optimisation and largest size of these, how many working thresholds from
@@ -165,6 +173,7 @@ def search(
             break
     if len(pool) == 0:
         return None
+    pool.complete()
     if not pool.agrees(_CLOSE_AGREEMENT):
         pool.optimise()
         agreed = pool.agrees()
@@ -238,6 +247,10 @@ class _Pool:
         self.threshold = threshold
         self.working = threshold
         self.votes: Floats = np.empty(0)
+        #: Index of the best hypothesis.
+        self.best = 0
+        #: The matches that are not on a dominant plane, if there is one.
+        self._off_plane: Bools | None = None
         self._X = X
         self._reliable = reliable
         self._rng = rng
@@ -252,11 +265,6 @@ class _Pool:
     def __len__(self) -> int:
         return len(self._G)
 
-    @property
-    def best(self) -> int:
-        """Index of the hypothesis with the most votes."""
-        return int(self.votes.argmax())
-
     def add(self, F: Floats, sizes: ArrayLike) -> None:
         """Polish hypotheses (m, 3, 3), in pixels, drawn from ``sizes`` matches, and count votes."""
         G = self._polished(F)
@@ -267,6 +275,19 @@ class _Pool:
         self._squared = np.concatenate([self._squared, squared])
         self.votes = np.concatenate([self.votes, votes])
         self._sizes = np.concatenate([self._sizes, sizes])
+        self.best = int(self.votes.argmax()) if self._off_plane is None else self._richest()
+
+    def _richest(self) -> int:
+        """Index of the most votes, or of as many inliers on the plane and more off it."""
+        elected = int(self.votes.argmax())
+        inliers = self._inliers()
+        common = inliers @ inliers[elected]
+        off_plane = inliers[:, self._off_plane]
+        gain = off_plane - off_plane[elected]
+        lead = gain.sum(axis=1) - _SIGNIFICANT * np.sqrt(np.abs(gain).sum(axis=1))
+        lead[common < _CONTAINED * common[elected]] = -np.inf
+        # Its own lead is 0.
+        return int(lead.argmax()) if lead.max() > 0 else elected
 
     def _poll(self, G: Floats) -> tuple[Floats, Floats]:
         """Squared residuals (m, n) of hypotheses and the votes for them (m,)."""
@@ -291,6 +312,17 @@ class _Pool:
     def near_best(self, width: float) -> Bools:
         """Mark the matches within ``width`` working thresholds of the best hypothesis."""
         return np.asarray(self._squared[self.best] < (width * self.working) ** 2)
+
+    def complete(self) -> None:
+        """Where a plane has most inliers of the best hypothesis, add others of that plane."""
+        width = _PLANE_WIDTH * self.working
+        inliers = self.near_best(1.0)
+        G, off_plane = plane_and_parallax(
+            self._frame, self._G[self.best], inliers, width, self._rng
+        )
+        if len(G):
+            self._off_plane = off_plane
+            self.add(self._frame.leave(G), np.zeros(len(G)))
 
     def optimise(self) -> None:
         """Fit samples of the best hypothesis's neighbours; the fit with the most votes joins.

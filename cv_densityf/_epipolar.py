@@ -95,6 +95,15 @@ def _lmeds_threshold(error: Floats) -> float:
 _ROWS, _COLUMNS = np.triu_indices(9)
 _SQUARE = np.empty((9, 9), dtype=np.intp)
 _SQUARE[_ROWS, _COLUMNS] = _SQUARE[_COLUMNS, _ROWS] = np.arange(45)
+#: Rows of the triangle with x_i x_j of the first image, which is x'_3 x_i x'_3 x_j, and x'_i x'_j
+#: of the second one; and the two 3 x 3 matrices from these rows.
+_MOMENT_ROWS, _MOMENTS = np.unique(
+    np.stack([_SQUARE[6:, 6:], _SQUARE[2::3, 2::3]]), return_inverse=True
+)
+_MOMENTS = _MOMENTS.reshape(2, 3, 3)
+#: OpenBLAS starts threads for products of more multiplications. They save microseconds, and cost
+#: milliseconds where the cores are busy; and the sums would depend on their number.
+_ONE_THREAD = 2**18
 
 
 class Frame:
@@ -106,8 +115,8 @@ class Frame:
     """
 
     __slots__ = (
-        *("_first", "_from_first", "_from_second", "_second"),
-        *("homogeneous1", "homogeneous2", "outer", "products", "scale"),
+        *("_first", "_from_first", "_from_second", "_outer", "_second", "_squares"),
+        *("homogeneous1", "homogeneous2", "products", "scale"),
     )
 
     def __init__(self, X: Floats, about: tuple[Floats, float] | None = None) -> None:
@@ -118,11 +127,12 @@ class Frame:
         self.homogeneous1 = np.concatenate([Z[:2], ones])
         self.homogeneous2 = np.concatenate([Z[2:], ones])
         self.products = (self.homogeneous2[:, None] * self.homogeneous1[None]).reshape(9, -1)
-        self.outer = np.empty((45, len(X)))
+        self._outer = np.empty((45, len(X)))
         row = 0
         for i in range(9):
-            np.multiply(self.products[i], self.products[i:], out=self.outer[row : row + 9 - i])
+            np.multiply(self.products[i], self.products[i:], out=self._outer[row : row + 9 - i])
             row += 9 - i
+        self._squares = self._outer[_MOMENT_ROWS]
         zoom, unzoom = (np.diag([s, s, 1.0]) for s in (self.scale, 1.0 / self.scale))
         self._first, self._from_first = zoom @ shift(-centre[:2]), shift(centre[:2]) @ unzoom
         self._second, self._from_second = zoom @ shift(-centre[2:]), shift(centre[2:]) @ unzoom
@@ -130,7 +140,7 @@ class Frame:
     def part(self, rows: NDArray[np.bool_]) -> Frame:
         """Return the same frame, holding only the matches marked in ``rows`` (n,)."""
         part = copy(self)
-        for name in ("homogeneous1", "homogeneous2", "outer", "products"):
+        for name in ("_outer", "_squares", "homogeneous1", "homogeneous2", "products"):
             setattr(part, name, getattr(self, name)[:, rows])
         return part
 
@@ -150,11 +160,33 @@ class Frame:
 
     def errors(self, G: Floats) -> tuple[Floats, Floats]:
         """Algebraic error and squared gradient norm of each match under each matrix, (m, n)."""
-        lines2 = G[:, :2] @ self.homogeneous1
-        lines1 = G.transpose(0, 2, 1)[:, :2] @ self.homogeneous2
-        norm = np.einsum("mkn,mkn->mn", lines2, lines2)
-        norm += np.einsum("mkn,mkn->mn", lines1, lines1)
-        return G.reshape(-1, 9) @ self.products, norm
+        algebraic, norm = np.empty((2, len(G), self.products.shape[1]))
+        for part in self._parts(9 * len(G)):
+            lines2 = G[:, :2] @ self.homogeneous1[:, part]
+            lines1 = G.transpose(0, 2, 1)[:, :2] @ self.homogeneous2[:, part]
+            np.einsum("mkn,mkn->mn", lines2, lines2, out=norm[:, part])
+            norm[:, part] += np.einsum("mkn,mkn->mn", lines1, lines1)
+            np.matmul(G.reshape(-1, 9), self.products[:, part], out=algebraic[:, part])
+        return algebraic, norm
+
+    def gram(self, weights: Floats) -> Floats:
+        """Weighted sums (m, 9, 9) of the outer squares of `products`, for weights (m, n)."""
+        return self._sums(weights, self._outer)[:, _SQUARE]
+
+    def moments(self, weights: Floats) -> Floats:
+        """Weighted sums (m, 2, 3, 3) of x x^T of either image, for weights (m, n)."""
+        return self._sums(weights, self._squares)[:, _MOMENTS]
+
+    def _sums(self, weights: Floats, rows: Floats) -> Floats:
+        """Weighted sums (m, r) of ``rows`` (r, n), for weights (m, n)."""
+        parts = self._parts(len(rows) * len(weights))
+        return np.asarray(sum(weights[:, part] @ rows[:, part].T for part in parts))
+
+    def _parts(self, multiplications: int) -> list[slice]:
+        """Cut the matches, of so many multiplications each, to what one thread of BLAS does."""
+        n = self.products.shape[1]
+        size = max(1, _ONE_THREAD // multiplications)
+        return [slice(start, start + size) for start in range(0, n, size)]
 
     def sampson(self, G: Floats) -> Floats:
         """Squared Sampson distances in squared pixels, (m, n)."""
@@ -185,6 +217,8 @@ _TINY = 1e-300
 #: Matches this many times as far out as three quarters of them cannot be in the image.
 FAR = 5.0
 _EYE = np.eye(7)
+#: D, which leaves of a line's three coefficients the two that make its normal.
+_NORMAL = np.diag([1.0, 1.0, 0.0])
 #: Of the products u_i v_j^T, row by row, those of a tangent space: not u_3 v_3^T, and u_1 v_1^T
 #: makes room for what u_1 v_1^T and u_2 v_2^T have left.
 _TANGENT = np.array([0, 1, 2, 3, 5, 6, 7])
@@ -275,8 +309,10 @@ def polish(
     Minimises the Sampson distances under Geman-McClure weights ``1 / (1 + (r / scale)^2)^2`` over
     the seven degrees of freedom of a matrix of rank 2: a step in the tangent space at
     ``U diag(s_1, s_2, 0) V^T``, then the nearest matrix of rank 2 (Absil, Mahony and Sepulchre,
-    "Optimization algorithms on matrix manifolds", 2008). The gradient norm in the Sampson distance
-    is held fixed within a step, as in iteratively reweighted least squares.
+    "Optimization algorithms on matrix manifolds", 2008). The gradient is exact: to hold the
+    denominator of the Sampson distance fixed, as iteratively reweighted least squares do, would
+    end beside the minimum, far beside it where the baseline is short (Chojnacki, Brooks, van den
+    Hengel and Gawley, "On the fitting of surfaces to data with covariances", PAMI 2000).
 
     Parameters
     ----------
@@ -307,12 +343,16 @@ def polish(
         algebraic, norm = frame.errors(G)
         norm += _TINY
         width = np.asarray(scale, dtype=float).reshape(-1, 1) * frame.scale
-        weight = 1.0 / (1.0 + algebraic * algebraic / (norm * width**2))
+        squared = algebraic * algebraic / norm
+        weight = 1.0 / (1.0 + squared / width**2)
         weight *= weight / norm
-        gram = (weight @ frame.outer.T)[:, _SQUARE]
-        half = tangent @ gram
+        half = tangent @ frame.gram(weight)
         hessian = half @ tangent.transpose(0, 2, 1)
         gradient = half @ G.reshape(m, 9, 1)
+        # The denominator's part, half the derivative of x^T G^T D G x + x'^T G D G^T x'.
+        moments = frame.moments(weight * squared)
+        drift = _NORMAL @ G @ moments[:, 0] + moments[:, 1] @ G @ _NORMAL
+        gradient -= tangent @ drift.reshape(m, 9, 1)
         if noise is not None:
             nudge = _NUDGE * tangent.reshape(m, 7, 3, 3)
             nudged = G[:, None] + np.concatenate([0.0 * nudge[:, :1], nudge, -nudge], 1)

@@ -74,9 +74,9 @@ class Estimate:
     timings : dict of str to float
         Milliseconds per stage.
     votes : tuple of float
-        The vote for each polished hypothesis of the last search, in the order of the draws; where
-        no two draws agree closely, then for that of the local optimisation. Of many matches, those
-        of the part that searched.
+        The vote for each polished hypothesis of the last search, in the order of the draws; then
+        for those of a dominant plane, and for that of the local optimisation, where there were any.
+        Of many matches, those of the part that searched.
 
     See Also
     --------
@@ -288,7 +288,7 @@ def _on_a_line(X: NDArray[np.float64]) -> bool:
     columns = np.ascontiguousarray(X.T)
     largest = np.abs(columns).max(axis=1)
     centred = columns - columns.mean(axis=1, keepdims=True)
-    covariance = centred @ centred.T / len(X)
+    covariance = np.einsum("in,jn->ij", centred, centred) / len(X)
     for image in (slice(0, 2), slice(2, 4)):
         (a, b), (_, d) = covariance[image, image]
         smallest = 0.5 * (a + d - np.hypot(a - d, 2.0 * b))

@@ -261,11 +261,41 @@ def test_reliability_finds_what_is_lost_without():
     assert np.median(unknown) > 3 * np.median(known)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_one_plane_does_not_win(seed):
-    """Nine tenths of the right matches on a plane: F must hold off it."""
-    X, judges = mostly_one_plane(seed)
+@pytest.mark.parametrize(("inlier_ratio", "share"), [(0.6, 0.9), (1.0, 0.9), (0.9, 0.95)])
+@pytest.mark.parametrize("seed", range(8))
+def test_one_plane_does_not_win(seed, inlier_ratio, share):
+    """Nearly all right matches on a plane: F must hold off it."""
+    X, judges = mostly_one_plane(seed, inlier_ratio=inlier_ratio, share=share)
     assert np.median(sampson_distance(find(X).F, judges)) < 1.5
+
+
+@pytest.mark.parametrize(("more", "best"), [(3, 0), (8, 1)])
+def test_on_a_plane_significantly_more_off_it_are_better_than_votes(more, best):
+    """They may be of no reliability; two standard deviations of chance decide."""
+    squared = np.full((2, 60), 9.0)
+    squared[0, :40] = squared[1, : 40 + more] = 0.0
+    assert elected(squared, off_plane=np.arange(60) >= 38) == best
+    assert elected(squared, off_plane=None) == 0
+
+
+def test_on_a_plane_what_differs_on_it_does_not_count():
+    squared = np.full((2, 60), 9.0)
+    squared[0, 4:44] = squared[1, :40] = squared[1, 44:52] = 0.0
+    assert elected(squared, off_plane=np.arange(60) >= 44) == 1
+
+
+def test_more_off_the_plane_without_the_plane_are_no_better():
+    squared = np.full((2, 60), 9.0)
+    squared[0, :20] = squared[1, 5:] = 0.0
+    assert elected(squared, off_plane=np.arange(60) >= 20) == 0
+
+
+def elected(squared, off_plane):
+    """Best of two hypotheses, the first of which has more votes, by their residuals."""
+    pool = _Pool(true_matches(0, 60), np.ones(60), np.arange(60), 1.0, np.random.default_rng(0))
+    pool._off_plane = off_plane
+    pool._append(np.ones((2, 3, 3)), squared, np.array([5.0, 1.0]), [30, 60])
+    return pool.best
 
 
 def test_no_draw_no_answer(monkeypatch):

@@ -1,0 +1,78 @@
+"""Fundamental matrices that share a dominant plane and differ in what lies off it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cv_densityf._epipolar import Frame
+
+Floats = NDArray[np.floating]
+Bools = NDArray[np.bool_]
+
+#: A plane is dominant with at least this share of the inliers, and so many: six are always on one.
+_DOMINANT = 0.5
+_FEWEST = 12
+#: Steps to the plane of most inliers, each with little weight for what is off the last one's.
+_STEPS = 3
+#: Pairs of matches tried, and how many of the hypotheses through them are worth a polish.
+_PAIRS = 512
+_BEST = 2
+
+
+def plane_and_parallax(
+    frame: Frame,
+    G: Floats,
+    inliers: Bools,
+    width: float,
+    rng: np.random.Generator,
+) -> tuple[Floats, Bools]:
+    """Look for fundamental matrices with the dominant plane of one, and other epipoles.
+
+    If nearly all inliers are on a plane, F is any of the three-dimensional family ``[e']_x H``, and
+    a wrong one of these has nearly as many inliers as the right one. The family is what the plane's
+    matches leave free: the three smallest eigenvectors of the sum of their outer squares. Two more
+    matches off the plane fix F. Chum, Werner and Matas, "Two-view geometry estimation unaffected
+    by a dominant plane" (CVPR 2005), who draw the pairs with the homography of a minimal sample.
+
+    Parameters
+    ----------
+    frame : Frame
+        The matches.
+    G : array, shape (3, 3)
+        A matrix in the frame.
+    inliers : array, shape (n,)
+        Its inliers.
+    width : float
+        Pixels within which a match is on the plane, and for a hypothesis.
+    rng : numpy.random.Generator
+        Of the pairs.
+
+    Returns
+    -------
+    hypotheses : array, shape (m, 3, 3)
+        The best ones in the frame; none if there is no dominant plane.
+    off_plane : array, shape (n,)
+        The matches that are not on it.
+    """
+    _, norm = frame.errors(G[None])
+    plane: Floats = inliers.astype(np.float64)
+    for _ in range(_STEPS):
+        family = np.linalg.eigh(frame.gram(plane / norm))[1][0, :, :3]
+        coordinates = family.T @ frame.products
+        squared = (coordinates**2).sum(axis=0) / (norm[0] * (frame.scale * width) ** 2)
+        plane = inliers / (1.0 + squared) ** 2
+    off_plane = squared >= 1.0
+    on_plane = np.count_nonzero(inliers & ~off_plane)
+    n = np.count_nonzero(off_plane)
+    if on_plane < max(_FEWEST, _DOMINANT * np.count_nonzero(inliers)) or n < 2:
+        return np.empty((0, 3, 3)), off_plane
+    first = rng.integers(n, size=_PAIRS)
+    second = (first + rng.integers(1, n, size=_PAIRS)) % n
+    through = coordinates[:, off_plane].T
+    hypotheses = np.cross(through[first], through[second]) @ family.T
+    hypotheses = hypotheses.reshape(-1, 3, 3)
+    hypotheses /= np.linalg.norm(hypotheses, axis=(1, 2), keepdims=True)
+    squared = frame.part(off_plane).sampson(hypotheses)
+    votes = np.maximum(0.0, 1.0 - squared / width**2).sum(axis=1)
+    return hypotheses[np.argsort(-votes, kind="stable")[:_BEST]], off_plane
