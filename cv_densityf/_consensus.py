@@ -40,6 +40,9 @@ ROUNDS = (
     (0.25, 1.0),
 )
 _NEAR_WIDTH = 8.0
+#: What the draws agree on may be one of several motions: with more than this share of the reliable
+#: half unexplained, one more draw is from all that is unexplained, before they may end.
+_UNEXPLAINED = 0.25
 #: Matches a draw gets at least: fewer crowd on too little of the image to fix F.
 MIN_DRAW = 30
 #: cv2's iterations in one draw from a quarter of the ranked matches, and less from larger, less
@@ -124,8 +127,10 @@ def search(
     Rounds of draws on nested sets of the most reliable matches, on all that are ranked, and on what
     the best hypothesis so far leaves near its epipolar lines: a nearly right F has the right one's
     inliers there. Each hypothesis is polished on all matches. The draws end when a second,
-    independent one arrives at the best hypothesis's inliers, or after `ROUNDS` on each ranking.
-    Unless the two are nearly the same, the best hypothesis is then optimised locally.
+    independent one arrives at the best hypothesis's inliers, and one from what these leave, if that
+    is much, is no better; or after `ROUNDS` on each ranking. Where most inliers are on a plane,
+    other hypotheses of that plane are then tried. Unless two draws are nearly the same, the best
+    hypothesis is optimised locally.
 
     Parameters
     ----------
@@ -197,7 +202,7 @@ def _fill(
 ) -> tuple[int, bool]:
     """Make rounds of draws until two of them agree; how many it took, and whether they do."""
     points = X[order].astype(np.float32)
-    n_draws = 0
+    n_draws, asked_rest = 0, False
     for fractions in ROUNDS:
         found, sizes = [], []
         for fraction in fractions:
@@ -223,6 +228,18 @@ def _fill(
             pool.add(F if len(pool) else pool.adapted(F), sizes)
         watch.lap("polish")
         agreed = pool.agrees()
+        if agreed and not asked_rest:
+            asked_rest = True
+            rest = ~pool.near_best(_NEAR_WIDTH)[order]
+            if rest[: len(order) // 2].mean() > _UNEXPLAINED:
+                iters = min(max_iters, MAX_DRAW_ITERS // 2)
+                F = draw(points[rest], pool.working, confidence, iters, seed + n_draws)
+                n_draws += 1
+                watch.lap("draws")
+                if F is not None:
+                    pool.add(F[None], [0])
+                    agreed = pool.agrees()
+                watch.lap("polish")
         if agreed:
             break
     return n_draws, agreed
@@ -406,17 +423,18 @@ def _noise(squared: Floats, threshold: float) -> float:
     """Robust standard deviation of the inliers' residuals, pixels.
 
     1.4826 times the median of the residuals below the threshold, then of those below 2.5 of these
-    standard deviations, four times, by when it has settled.
+    standard deviations, four times, by when it has settled; with Rousseeuw and Leroy's factor for
+    few residuals, which a fit has made smaller.
     """
     r = np.sqrt(np.sort(squared))
     cut, sigma = threshold, 0.4 * threshold
     for _ in range(4):
         below = int(r.searchsorted(cut))
         if below < 8:
-            break
+            return sigma
         sigma = 1.4826 * float(r[below // 2])
         cut = min(_WIDEST * threshold, 2.5 * sigma)
-    return sigma
+    return sigma * (1.0 + 5.0 / max(below - 7, 5))
 
 
 class _Ballot:

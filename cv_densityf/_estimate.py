@@ -38,7 +38,7 @@ MAX_RANKED = 1_000
 _CELLS = (16, 8)
 #: The noise is the data's, and the caller's threshold rules the mask: the search has this part of
 #: the points' spread for its threshold, 1 to 3 px in a photograph, as far as it is within this
-#: factor of the caller's.
+#: factor of the caller's; below half of it, right matches may not agree any more.
 _SEARCH_THRESHOLD = 0.01
 _LEEWAY = 2.0
 #: An F that explains fewer matches than a minimal sample is none.
@@ -229,7 +229,8 @@ def _search_threshold(spread: float, robust: Robust, density: str) -> float:
         return own
     if density == "paper":  # th of its step 5
         return robust.threshold
-    return min(max(own, robust.threshold / _LEEWAY), robust.threshold * _LEEWAY)
+    most = max(robust.threshold * _LEEWAY, own / _LEEWAY)
+    return min(max(own, robust.threshold / _LEEWAY), most)
 
 
 def _rankings(
@@ -365,7 +366,8 @@ def estimate_fundamental(
     threshold : float
         Largest residual of an inlier, pixels, in (1e-12, 1e6); unused by ``"lmeds"``, which finds
         its own. It rules the mask: the search has one of its own, a hundredth of the points'
-        spread, within a factor of two of this one; ``density="paper"`` takes this one.
+        spread, within a factor of two of this one, at least half of it; ``density="paper"`` takes
+        this one.
     confidence : float
         Of each draw to have found the best model, in (0, 1).
     max_iters : int

@@ -227,6 +227,23 @@ def test_local_optimisation_finds_more_votes_near_a_poor_hypothesis(seed):
     assert not pool.agrees()
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_a_denser_motion_does_not_win_over_the_larger_one(seed):
+    """Draws on the densest agree on it; what it leaves has a say before they end."""
+    rng = np.random.default_rng(seed)
+    larger = true_matches(seed, 300)
+    denser = 300 + 0.3 * true_matches(seed + 50, 240)
+    X = np.vstack([larger, denser])
+    reliability = np.r_[rng.uniform(0.0, 0.8, 300), rng.uniform(0.3, 1.0, 240)]
+    assert np.median(sampson_distance(find(X, reliability).F, larger)) < 0.1
+
+
+def test_little_that_is_unexplained_is_not_drawn_from(monkeypatch):
+    draws = spied_draws(monkeypatch, _engine.draw)
+    X = scene_of(0, inlier_ratio=0.9).X
+    assert find(X).n_draws == len(draws) == 2
+
+
 def test_two_different_answers_are_no_agreement(monkeypatch):
     """The search goes through all its rounds when no two draws are of the same geometry."""
     X = scene_of(0).X
