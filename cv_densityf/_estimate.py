@@ -371,7 +371,7 @@ def estimate_fundamental(
     confidence : float
         Of each draw to have found the best model, in (0, 1).
     max_iters : int
-        Bound on the iterations of each draw, at least 1. The default rule's draws end after a
+        Bound on the iterations of each draw, in [1, 2^31). The default rule's draws end after a
         thousand in any case, those of ``"paper"`` and of cv2's own call only here.
     density : {"contrast", "paper", "off"}
         Rule for the dense part: density contrast, Wu and Wan's rho * delta, or none.
@@ -420,7 +420,9 @@ def estimate_fundamental(
         "threshold", threshold, Real, lambda v: 1e-12 < v < 1e6, "a number above 1e-12, below 1e6"
     )
     _check("confidence", confidence, Real, lambda v: 0 < v < 1, "a number inside (0, 1)")
-    _check("max_iters", max_iters, Integral, lambda v: v >= 1, "an integer, at least 1")
+    _check(
+        "max_iters", max_iters, Integral, lambda v: 1 <= v < 2**31, "an integer from 1 to 2^31 - 1"
+    )
     check_density(density, alpha, dc_percent)
     in_range = range(2**31).__contains__
     _check("random_state", random_state, Integral, in_range, "an integer from 0 to 2^31 - 1")

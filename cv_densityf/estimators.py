@@ -423,7 +423,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         spread, within a factor of two of this one.
     confidence : float in (0, 1), default=0.999
         Wanted probability that the result is right.
-    max_iters : int >= 1, default=5000
+    max_iters : int in [1, 2^31), default=5000
         Bound on the iterations of each draw; those of ``prefilter="auto"`` end after a thousand
         in any case.
     random_state : int, RandomState or None, default=0
@@ -487,7 +487,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         "method": [str, Integral],
         "threshold": [Interval(Real, 0, None, closed="neither")],
         "confidence": [Interval(Real, 0, 1, closed="neither")],
-        "max_iters": [Interval(Integral, 1, None, closed="left")],
+        "max_iters": [Interval(Integral, 1, 2**31 - 1, closed="both")],
         "random_state": ["random_state"],
     }
 

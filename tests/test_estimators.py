@@ -290,7 +290,7 @@ def test_swapped_images_are_noticed(scene):
     "parameters",
     [
         {"prefilter": "density"}, {"method": "magic"}, {"method": 99}, {"threshold": 0.0},
-        {"confidence": 1.0}, {"max_iters": 0}, {"random_state": "seed"},
+        {"confidence": 1.0}, {"max_iters": 0}, {"max_iters": 2**31}, {"random_state": "seed"},
     ],
 )  # fmt: skip
 def test_wrong_parameters_are_refused(scene, parameters):
