@@ -417,7 +417,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
     method : str or int, default="usac_accurate"
         cv2's method: "ransac", "lmeds", "8point", "7point", "usac_default", "usac_parallel",
         "usac_fm_8pts", "usac_fast", "usac_accurate", "usac_prosac", "usac_magsac", or its constant.
-    threshold : float > 0, default=1.0
+    threshold : float in (1e-12, 1e6), default=1.0
         Largest distance of an inlier, in pixels. "lmeds" finds its own. It rules the masks: the
         search of ``prefilter="auto"`` has a threshold of its own, a hundredth of the points'
         spread, within a factor of two of this one.
@@ -485,7 +485,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "prefilter": [StrOptions({"auto"}), HasMethods("fit_predict"), None],
         "method": [str, Integral],
-        "threshold": [Interval(Real, 0, None, closed="neither")],
+        "threshold": [Interval(Real, 1e-12, 1e6, closed="neither")],
         "confidence": [Interval(Real, 0, 1, closed="neither")],
         "max_iters": [Interval(Integral, 1, 2**31 - 1, closed="both")],
         "random_state": ["random_state"],

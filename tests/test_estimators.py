@@ -298,6 +298,15 @@ def test_wrong_parameters_are_refused(scene, parameters):
         FundamentalMatrixEstimator(**parameters).fit(scene.X)
 
 
+@pytest.mark.parametrize("threshold", [1e-300, 1e-12, 1e6, 1e300])
+def test_thresholds_are_those_of_the_function(scene, threshold):
+    with pytest.raises(ValueError, match="threshold is"):
+        estimate_fundamental(scene.points1, scene.points2, threshold=threshold)
+    for prefilter in ("auto", None):
+        with pytest.raises(ValueError, match="'threshold' parameter"):
+            FundamentalMatrixEstimator(prefilter, threshold=threshold).fit(scene.X)
+
+
 def test_unfitted(scene):
     for method in ("predict", "score_samples", "decision_function", "score"):
         with pytest.raises(NotFittedError):
