@@ -216,11 +216,10 @@ def _failure(pair: Pair, reason: str) -> Estimate:
         n = len(pair[0])  # type: ignore[arg-type]
     except Exception:
         n = 0
-    nothing = np.zeros(n, dtype=bool)
     return Estimate(
         F=None,
-        mask=nothing,
-        kept=nothing,
+        mask=np.zeros(n, dtype=bool),
+        kept=np.zeros(n, dtype=bool),
         reliability=np.full(n, np.nan),
         n_draws=0,
         engine="none",

@@ -92,7 +92,8 @@ def test_a_bad_pair_fails_alone(pairs, n_jobs):
     assert same(found[-1], estimate_fundamental(*pairs[2]))
     assert found[1].reason.startswith("ValueError: points1 has")
     assert found[1].mask.shape == (len(points1),)
-    assert found[2].mask.shape == (3,)
+    assert found[2].mask.shape == found[2].kept.shape == (3,)
+    assert not any(np.shares_memory(estimate.mask, estimate.kept) for estimate in found)
     assert all(estimate.n_inliers == 0 and estimate.reason for estimate in found[1:-1])
 
 
