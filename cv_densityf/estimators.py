@@ -226,8 +226,8 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
     dc_percent : float in (0, 100], default=2.0
         Cut-off distance of the paper's rule, see `DensityPeaks`.
     keep : float in (0, 1] or None, default=None
-        Share of the rows to keep, the most reliable first, whichever the rule. When None the rule
-        decides.
+        Share of the rows to keep, at least one, the most reliable first, whichever the rule. When
+        None the rule decides.
 
     Attributes
     ----------
@@ -251,8 +251,8 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
     `fit_resample` lets it be a step of imbalanced-learn's Pipeline; scikit-learn's own Pipeline
     allows no step that drops rows.
 
-    Fewer than 15 rows are never left: all are kept then, with a warning, since cv2 estimates
-    differently (by LMEDS) from fewer.
+    Rows are only dropped where 15 or more are left: all are kept otherwise, with a warning, since
+    cv2 estimates differently (by LMEDS) from fewer.
 
     References
     ----------
@@ -318,7 +318,7 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
         Warns
         -----
         UserWarning
-            If fewer than 15 rows would be left; all are kept then.
+            If rows were to be dropped and fewer than 15 would be left; all are kept then.
         """
         self._validate_params()
         matches = self._validated(X)
@@ -338,7 +338,9 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
             if weight is not None:
                 reliability = with_scores(ranks(reliability), weight)
         if weight is not None or self.keep is not None:
-            n_kept = round(self.keep * n) if self.keep is not None else np.count_nonzero(support)
+            n_kept = np.count_nonzero(support)
+            if self.keep is not None:
+                n_kept = max(1, round(self.keep * n))
             support = np.zeros(n, dtype=bool)
             support[np.argsort(-reliability, kind="stable")[:n_kept]] = True
         self.reliability_: NDArray[np.float64] = reliability
@@ -540,8 +542,8 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         Warns
         -----
         UserWarning
-            If the prefilter leaves fewer than 15 rows, or no fundamental matrix is found from
-            those it leaves; all rows are used then.
+            If the prefilter drops rows and leaves fewer than 15, or no fundamental matrix is found
+            from those it leaves; all rows are used then.
         """
         self._validate_params()
         robust = Robust(
@@ -712,7 +714,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
 def _enough(support: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the mask, or one of all rows, with a warning, where too few are left."""
     left = np.count_nonzero(support)
-    if left >= MIN_FILTERED:
+    if left >= MIN_FILTERED or left == len(support):
         return support
     warnings.warn(
         f"{left} of {len(support)} rows would be left, fewer than {MIN_FILTERED}: all are kept",

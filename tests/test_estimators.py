@@ -474,8 +474,20 @@ def test_too_few_rows_left_keeps_all(scene):
     with pytest.warns(UserWarning, match="1 of 400 rows would be left, fewer than 15"):
         filter_ = DensityPeaksFilter("paper", alpha=1.0).fit(scene.X)
     assert filter_.support_.all()
-    with pytest.warns(UserWarning, match="10 of 10 rows"):
-        assert DensityPeaksFilter().fit_predict(scene.X[:10]).all()
+    with pytest.warns(UserWarning, match="5 of 10 rows would be left"):
+        assert DensityPeaksFilter(keep=0.5).fit_predict(scene.X[:10]).all()
+    with pytest.warns(UserWarning, match="1 of 400 rows would be left"):
+        assert DensityPeaksFilter(keep=0.001).fit_predict(scene.X).all()
+
+
+@pytest.mark.parametrize("filter_", [DensityPeaksFilter(), DensityPeaksFilter("paper", keep=1.0)])
+def test_few_rows_of_which_none_would_be_dropped_are_no_warning(scene, filter_):
+    """Warnings are errors here."""
+    weight = np.arange(10.0)
+    assert filter_.fit_predict(scene.X[:10]).all()
+    assert filter_.fit_predict(scene.X[:10], sample_weight=weight).all()
+    estimator = FundamentalMatrixEstimator(filter_).fit(scene.X[:10])
+    assert estimator.candidate_mask_.all()
 
 
 def test_resampling_keeps_types_and_alignment(scene):
