@@ -610,7 +610,8 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         Returns
         -------
         ndarray of float, shape (n,)
-            At most 0, higher is better; ``-inf`` where the distance is undefined, at an epipole.
+            At most 0, higher is better; ``-inf`` where the distance is undefined, at an epipole,
+            or too large for a float.
         """
         check_is_fitted(self)
         return -self._residuals(self._validated(X, reset=False))
@@ -647,8 +648,9 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
             not compare thresholds by it.
         """
         check_is_fitted(self)
-        relative = self._residuals(self._validated(X, reset=False)) / self.threshold_
-        return float(np.maximum(0, 1 - np.square(relative)).mean())
+        residuals = self._residuals(self._validated(X, reset=False))
+        relative = np.minimum(residuals, self.threshold_) / self.threshold_
+        return float((1 - np.square(relative)).mean())
 
     def get_metadata_routing(self) -> MetadataRouter:
         """Describe which metadata go to the prefilter.
@@ -707,7 +709,8 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         return _epipolar.inlier_mask(self.F_, matches, self._rule, self.threshold_)
 
     def _residuals(self, matches: NDArray[np.float64]) -> NDArray[np.float64]:
-        distance = _epipolar.residuals(self.F_, matches, self._rule)
+        with np.errstate(all="ignore"):
+            distance = _epipolar.residuals(self.F_, matches, self._rule)
         return np.where(np.isnan(distance), np.inf, distance)
 
 

@@ -257,6 +257,18 @@ def test_the_epipole_is_no_inlier(scene):
     assert estimator.score(at_epipole) == 0
 
 
+@pytest.mark.parametrize("size", [1e30, 1e80, 1e155, 1e300])
+@pytest.mark.parametrize("method", ["ransac", "usac_magsac"])
+def test_coordinates_of_any_size_are_judged_in_silence(scene, method, size):
+    """Warnings are errors here."""
+    estimator = FundamentalMatrixEstimator(method=method).fit(scene.X)
+    far = scene.X * size
+    assert not estimator.predict(far).any()
+    assert (estimator.score_samples(far) < -1).all()
+    assert (estimator.decision_function(far) < 0).all()
+    assert estimator.score(far) == 0
+
+
 @pytest.mark.parametrize("method", ["lmeds", "usac_magsac"])
 def test_a_row_is_judged_alone(scene, method):
     """LMEDS takes its scale from the rows of fit, so that one new row has an answer too."""
