@@ -700,7 +700,8 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         self.threshold_: float = robust.threshold
         if rule == "lmeds":
             # The scale is that of the rows of fit; from then on the rule is RANSAC's.
-            errors = np.square(_epipolar.residuals(self.F_, matches, rule)).astype(np.float32)
+            with np.errstate(all="ignore"):
+                errors = np.square(_epipolar.residuals(self.F_, matches, rule)).astype(np.float32)
             self.threshold_ = float(_epipolar._lmeds_threshold(errors[np.isfinite(errors)]))
             rule = "ransac"
         self._rule: Rule = rule

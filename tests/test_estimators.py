@@ -269,6 +269,14 @@ def test_coordinates_of_any_size_are_judged_in_silence(scene, method, size):
     assert estimator.score(far) == 0
 
 
+@pytest.mark.parametrize("prefilter", ["auto", None])
+def test_lmeds_takes_its_scale_from_the_rest_in_silence(scene, prefilter):
+    X = np.concatenate([scene.X, np.full((1, 4), 1e30)])
+    estimator = FundamentalMatrixEstimator(prefilter, method="lmeds").fit(X)
+    assert not estimator.inlier_mask_[-1]
+    assert np.isfinite(estimator.threshold_)
+
+
 @pytest.mark.parametrize("method", ["lmeds", "usac_magsac"])
 def test_a_row_is_judged_alone(scene, method):
     """LMEDS takes its scale from the rows of fit, so that one new row has an answer too."""
