@@ -678,6 +678,7 @@ def test_two_hundred_thousand_points():
         ({"scores": np.ones((75, 2))}, r"scores has shape \(75, 2\); it must be \(n,\)"),
         ({"scores": np.ones((150, 1, 1))}, "scores has shape"),
         ({"scores": 1.0}, "scores has shape"),
+        ({"scores": np.full(150, 1j)}, "scores is of type complex128"),
         ({"scores": np.full(150, np.nan)}, "scores has NaN; give .* the lowest score"),
     ],
     ids=str,

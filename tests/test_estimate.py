@@ -633,6 +633,8 @@ GOOD = np.zeros((20, 2))
         ({"threshold": True}, "threshold is True; it must be "),
         ({"scores": np.zeros(19)}, "scores has 19 entries for 20 matches"),
         ({"scores": np.full(20, np.nan)}, "scores has NaN; give .* the lowest score"),
+        ({"scores": np.ones(20, complex)}, "scores is of type complex128; .* real numbers"),
+        ({"scores": [1j] * 20}, "scores is of type complex128"),
     ],
 )
 def test_wrong_options_are_named_with_what_to_do(options, message):
@@ -648,6 +650,7 @@ def test_wrong_options_are_named_with_what_to_do(options, message):
         (GOOD, np.zeros((20, 3)), r"points2 has shape \(20, 3\)"),
         (np.zeros((20, 4)), GOOD, r"points1 has shape \(20, 4\)"),
         (GOOD.ravel(), GOOD, r"points1 has shape \(40,\)"),
+        (GOOD.astype(np.complex64), GOOD, "points1 is of type complex64; .* real numbers"),
         (np.zeros((5, 4, 2)), GOOD, r"points1 has shape \(5, 4, 2\)"),
     ],
 )
