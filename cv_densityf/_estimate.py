@@ -424,8 +424,8 @@ def estimate_fundamental(
         "max_iters", max_iters, Integral, lambda v: 1 <= v < 2**31, "an integer from 1 to 2^31 - 1"
     )
     check_density(density, alpha, dc_percent)
-    in_range = range(2**31).__contains__
-    _check("random_state", random_state, Integral, in_range, "an integer from 0 to 2^31 - 1")
+    in_range = "an integer from 0 to 2^31 - 1"
+    _check("random_state", random_state, Integral, lambda v: 0 <= v < 2**31, in_range)
     return run(
         np.hstack([first, second]),
         Robust(method_flag(method), float(threshold), float(confidence), int(max_iters)),

@@ -659,6 +659,16 @@ def test_wrong_points_are_named_with_what_to_do(first, second, message):
         estimate_fundamental(first, second)
 
 
+@pytest.mark.timeout(20)
+def test_a_seed_of_numpys_is_checked_at_once():
+    """A range is searched number by number for what is no int."""
+    largest = np.int64(2**31 - 1)
+    found, same = (estimate_fundamental(GOOD, GOOD, random_state=s) for s in (largest, 2**31 - 1))
+    assert found.reason == same.reason
+    with pytest.raises(ValueError, match="random_state is"):
+        estimate_fundamental(GOOD, GOOD, random_state=largest + 1)
+
+
 def test_run_takes_params_and_their_rule():
     """The inner entry, as the drop-in calls it with ``cv2.UsacParams``."""
     params = cv2.UsacParams()
