@@ -18,7 +18,7 @@ import cv2
 
 from cv_densityf import cv2_api
 from cv_densityf._engine import original
-from cv_densityf._estimate import Density, Estimate, check_density
+from cv_densityf._estimate import Density, check_density
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,12 @@ class CallSite:
     calls : int
         Calls that came from there, errors included.
     passed_on : int
-        Calls that were cv2's own: see `cv_densityf.findFundamentalMat` for which.
+        Calls that cv2 answered: at once, see `cv_densityf.findFundamentalMat` for which, or because
+        the search had no answer.
     errors : int
         Calls that raised.
     no_model : int
-        Calls, not passed on, that found no fundamental matrix.
+        Calls that found no fundamental matrix; all of them are passed on, too.
     kept, dropped : int
         Matches of the dense part, and the rest, over all calls not passed on. Of a call with more
         than a thousand matches, those whose density was not looked at are among the rest.
@@ -91,29 +92,24 @@ def findFundamentalMat(*args: Any, **kwargs: Any) -> Any:
     try:
         answer, estimate = cv2_api.find(args, kwargs, **options)
     except BaseException:
-        _count(site, None, failed=True)
+        _count(site, errors=1)
         raise
-    _count(site, estimate)
+    if estimate is None or estimate.engine != "density":
+        _count(site, passed_on=1, no_model=int(answer[0] is None))
+    else:
+        kept = int(estimate.kept.sum())
+        _count(site, kept=kept, dropped=len(estimate.kept) - kept)
     return answer
 
 
 findFundamentalMat.__doc__ = cv2_api.findFundamentalMat.__doc__
 
 
-def _count(site: tuple[str, int], estimate: Estimate | None, failed: bool = False) -> None:
-    kept = 0 if estimate is None else int(estimate.kept.sum())
-    n = 0 if estimate is None else len(estimate.kept)
+def _count(site: tuple[str, int], **more: int) -> None:
     with _lock:
         old = _sites.get(site) or CallSite(*site)
-        _sites[site] = replace(
-            old,
-            calls=old.calls + 1,
-            passed_on=old.passed_on + (estimate is None and not failed),
-            errors=old.errors + failed,
-            no_model=old.no_model + (estimate is not None and estimate.F is None),
-            kept=old.kept + kept,
-            dropped=old.dropped + n - kept,
-        )
+        new = {name: getattr(old, name) + n for name, n in more.items()}
+        _sites[site] = replace(old, calls=old.calls + 1, **new)
 
 
 def patch_cv2(

@@ -26,6 +26,7 @@ from cv_densityf.patching import (
 
 SCENE = two_view_scene(200, inlier_ratio=0.4, random_state=3)
 P1, P2 = SCENE.points1, SCENE.points2
+LINE = np.arange(100.0)[:, None] * [1, 2]
 
 
 @pytest.fixture(autouse=True)
@@ -170,17 +171,20 @@ def test_counts_per_calling_line():
             cv2.findFundamentalMat(P1, P2, 36)
         cv2.findFundamentalMat(P1, P2, cv2.FM_8POINT)
         cv2.findFundamentalMat(P1 * np.nan, P2, 36)
+        cv2.findFundamentalMat(LINE, LINE, 36)
         with pytest.raises(cv2.error):
             cv2.findFundamentalMat(P1.tolist(), P2)
     sites = call_sites()
-    assert [site.calls for site in sites] == [3, 1, 1, 1]
+    assert [site.calls for site in sites] == [3, 1, 1, 1, 1]
     assert {site.filename for site in sites} == {__file__}
-    first, eight_point, nan, refused = sorted(sites, key=lambda site: site.line)
+    first, eight_point, nan, line, refused = sorted(sites, key=lambda site: site.line)
     assert (first.passed_on, first.no_model, first.errors) == (0, 0, 0)
     assert first.kept + first.dropped == 600
     assert 0 < first.kept < 600
     assert (eight_point.passed_on, eight_point.kept) == (1, 0)
-    assert (nan.passed_on, nan.no_model) == (0, 1)
+    assert (nan.passed_on, nan.no_model, nan.dropped) == (1, 1, 0)
+    # The search gives up on a line, where no match is any denser than the others.
+    assert (line.passed_on, line.errors, line.kept, line.dropped) == (1, 0, 0, 0)
     assert (refused.passed_on, refused.errors) == (0, 1)
     reset_call_sites()
     assert call_sites() == []

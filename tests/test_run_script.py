@@ -237,7 +237,7 @@ def test_report(tmp_path):
     assert 0 < calls[4] < calls[4] + calls[5] == 600
     assert found == {
         f"{path}:{line('FM_8POINT')}": [1, 1, 0, 0, 0, 0],
-        f"{path}:{line('nan')}": [1, 0, 0, 1, 0, 200],
+        f"{path}:{line('nan')}": [1, 1, 0, 1, 0, 0],
         f"{path}:{line('Mat(P1)')}": [1, 0, 1, 0, 0, 0],
     }
 
