@@ -28,9 +28,9 @@ class CallSite:
     Attributes
     ----------
     filename : str
-        File of the calling line.
+        File of the calling line, ``"<no file>"`` for calls from C without any Python below.
     line : int
-        Its number.
+        Its number, or 0.
     calls : int
         Calls that came from there, errors included.
     passed_on : int
@@ -78,8 +78,8 @@ def findFundamentalMat(*args: Any, **kwargs: Any) -> Any:
         patch = _patches[-1] if _patches else None
     if patch is None:  # somebody kept this function beyond the patch
         return original(*args, **kwargs)
-    caller = sys._getframe(1)
-    site = caller.f_code.co_filename, caller.f_lineno
+    caller = sys._getframe().f_back
+    site = ("<no file>", 0) if caller is None else (caller.f_code.co_filename, caller.f_lineno)
     # The extras are no parameters of cv2's function, but a patched program may know of us.
     options: dict[str, Any] = {
         "density": patch.density,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import _thread
 import subprocess
 import sys
 import textwrap
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import cv2
@@ -188,6 +190,18 @@ def test_counts_per_calling_line():
     assert (refused.passed_on, refused.errors) == (0, 1)
     reset_call_sites()
     assert call_sites() == []
+
+
+def test_a_call_from_no_line_at_all():
+    """A thread that is started in C has our function for its first frame."""
+    with patched():
+        _thread.start_new_thread(cv2.findFundamentalMat, (P1, P2, 36))
+        for _ in range(1000):
+            if call_sites():
+                break
+            time.sleep(0.01)
+    (site,) = call_sites()
+    assert (site.filename, site.line, site.calls, site.errors) == ("<no file>", 0, 1, 0)
 
 
 def test_looks_like_cv2s_function():
