@@ -196,8 +196,9 @@ def findFundamentalMat(
         methods scale it to ``F[2, 2] == 1`` and USAC to nothing in particular, and exactly 7 points
         give a classic method up to three matrices below each other, (9, 3).
     mask : (N, 1) ndarray of uint8, cv2.UMat if the points were, or None
-        1 for inliers: the method's own rule applied to ``F`` and all N matches. None together with
-        ``F`` for fewer than 7 points and where ``params`` finds no model.
+        1 for inliers: the method's own rule applied to ``F`` and all N matches. There is none for
+        fewer than 7 points and where ``params`` finds no model: None then, or an empty UMat if the
+        points were one, or the ``mask`` passed in, as it was for up to 7 points, else in zeros.
 
     Raises
     ------
@@ -438,7 +439,7 @@ def _no_model(call: Call, n: int, usac: bool, slot: _MaskSlot) -> tuple[None, An
     if call.params is not None:
         if isinstance(call.mask, np.ndarray):
             call.mask[...] = 0  # of any kind, since it is what comes back
-        return None, call.mask
+        return None, cv2.UMat() if call.mask is None and slot.as_umat else call.mask
     # cv2's direct solvers count every point as an inlier, model or not.
     direct = not usac and (n == 7 or call.method == cv2.FM_8POINT)
     return None, slot.deliver(np.full(n, direct))

@@ -519,6 +519,25 @@ def test_given_mask_is_zeroed_when_nothing_is_found(method, density):
     assert not answered.get().any()
 
 
+@pytest.mark.parametrize("density", ["contrast", "off"])
+@pytest.mark.parametrize("n", [9, 60])
+def test_params_without_a_model_give_the_kind_of_mask_that_cv2_gives(n, density):
+    points = np.full((n, 2), np.nan, np.float32)
+    umat = cv2.UMat(points)
+    for pair in ((umat, umat), (umat, points), (points, umat), (points, points)):
+        F, mask = findFundamentalMat(*pair, params(), density=density)
+        assert F is None
+        assert array(mask) is None
+        cv2s = outcome(original, *pair, params())
+        assert type(mask) is (cv2.UMat if any(p is umat for p in pair) else type(None))
+        assert isinstance(cv2s[0], int) or type(mask) is type(cv2s[1])
+        # A mask that is passed in is what comes back.
+        given = cv2.UMat(np.full((n, 1), 9, np.uint8))
+        _, mask = findFundamentalMat(*pair, params(), given, density=density)
+        assert isinstance(mask, cv2.UMat)
+        assert not mask.get().any()
+
+
 def test_mask_serves_recover_pose():
     F, mask = findFundamentalMat(P1, P2, cv2.USAC_MAGSAC, 1.0, 0.999, 1000)
     K = np.array([[800.0, 0, 500], [0, 800, 400], [0, 0, 1]])

@@ -185,7 +185,7 @@ def test_counts_per_calling_line():
     assert 0 < first.kept < 600
     assert (eight_point.passed_on, eight_point.kept) == (1, 0)
     assert (nan.passed_on, nan.no_model, nan.dropped) == (1, 1, 0)
-    # The search gives up on a line, where no match is any denser than the others.
+    # Not at once: the pipeline looks at these, and leaves them to cv2.
     assert (line.passed_on, line.errors, line.kept, line.dropped) == (1, 0, 0, 0)
     assert (refused.passed_on, refused.errors) == (0, 1)
     reset_call_sites()
