@@ -12,9 +12,13 @@ from numpy.typing import NDArray
 
 from cv_densityf._epipolar import Rule
 
+#: Attribute of our replacement of ``cv2.findFundamentalMat`` that holds cv2's function.
+CV2S_OWN = "__cv2s_own__"
+
 try:
-    #: Bound once, so that a later patch of ``cv2.findFundamentalMat`` cannot call itself.
-    original = cv2.findFundamentalMat
+    #: Bound once, so that a later patch of ``cv2.findFundamentalMat`` cannot call itself; nor can an
+    #: earlier one, where this module is loaded while cv2 is patched.
+    original = getattr(cv2.findFundamentalMat, CV2S_OWN, cv2.findFundamentalMat)
 except AttributeError:
     raise ImportError(
         "this cv2 has no findFundamentalMat; install a full build of OpenCV: "

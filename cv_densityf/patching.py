@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 
 from cv_densityf import cv2_api
-from cv_densityf._engine import original
+from cv_densityf._engine import CV2S_OWN, original
 from cv_densityf._estimate import Density, check_density
 
 
@@ -103,6 +103,7 @@ def findFundamentalMat(*args: Any, **kwargs: Any) -> Any:
 
 
 findFundamentalMat.__doc__ = cv2_api.findFundamentalMat.__doc__
+setattr(findFundamentalMat, CV2S_OWN, original)
 
 
 def _count(site: tuple[str, int], **more: int) -> None:
@@ -192,7 +193,8 @@ def patched(
         yield
     finally:
         with _lock:
-            _patches.remove(patch)
+            if patch in _patches:  # a reload forgets it
+                _patches.remove(patch)
             _uninstall()
 
 
@@ -224,3 +226,9 @@ def _uninstall() -> None:
     # If somebody has patched over us, theirs stays; ours passes calls on to cv2 from now on.
     if not _patches and is_patched():
         setattr(cv2, "findFundamentalMat", _before)  # noqa: B010
+
+
+# Loaded anew, this module knows of no patch, so none may be left in force; somebody else's wrapper
+# around ours has our attributes, and stays.
+if hasattr(cv2.findFundamentalMat, CV2S_OWN) and not hasattr(cv2.findFundamentalMat, "__wrapped__"):
+    setattr(cv2, "findFundamentalMat", original)  # noqa: B010

@@ -236,3 +236,62 @@ def test_limits_names_imported_before_and_worker_processes():
         """
     )
     assert done.returncode == 0, done.stderr
+
+
+AGAIN = {
+    "reload": """
+        for name in ("_engine", "cv2_api", "patching"):
+            importlib.reload(sys.modules[f"cv_densityf.{name}"])
+    """,
+    "import": """
+        for name in [name for name in sys.modules if name.startswith("cv_densityf")]:
+            del sys.modules[name]
+    """,
+}
+
+
+@pytest.mark.parametrize("again", AGAIN)
+@pytest.mark.parametrize("inside", [False, True])
+def test_loading_the_package_while_cv2_is_patched(again, inside):
+    code = f"""
+import cv2, importlib, sys
+import numpy as np
+cv2s = cv2.findFundamentalMat
+from cv_densityf.datasets import two_view_scene
+from cv_densityf.patching import patch_cv2, patched
+scene = two_view_scene(100, random_state=3)
+block = patched()
+block.__enter__() if {inside} else patch_cv2()
+assert cv2.findFundamentalMat is not cv2s
+{textwrap.dedent(AGAIN[again])}
+import cv_densityf
+from cv_densityf import _engine
+assert _engine.original is cv2s
+F, mask = cv_densityf.findFundamentalMat(scene.points1, scene.points2, 36, density="off")
+assert np.array_equal(F, cv2s(scene.points1, scene.points2, 36)[0])
+cv_densityf.unpatch_cv2()
+assert cv2.findFundamentalMat is cv2s
+cv_densityf.patch_cv2()
+assert cv_densityf.is_patched()
+assert not np.array_equal(cv2.findFundamentalMat(scene.points1, scene.points2, 36)[0], F)
+cv_densityf.unpatch_cv2()
+if {inside}:
+    block.__exit__(None, None, None)
+assert cv2.findFundamentalMat is cv2s
+"""
+    done = run_python(code)
+    assert done.returncode == 0, done.stderr
+
+
+def test_loading_anew_leaves_a_wrapper_around_ours():
+    done = run_python(
+        """
+        import cv2, functools, importlib
+        from cv_densityf import patching
+        patching.patch_cv2()
+        spy = cv2.findFundamentalMat = functools.wraps(cv2.findFundamentalMat)(lambda *_: None)
+        importlib.reload(patching)
+        assert cv2.findFundamentalMat is spy
+        """
+    )
+    assert done.returncode == 0, done.stderr
