@@ -16,8 +16,8 @@ from cv_densityf._epipolar import Rule
 CV2S_OWN = "__cv2s_own__"
 
 try:
-    #: Bound once, so that a later patch of ``cv2.findFundamentalMat`` cannot call itself; nor can an
-    #: earlier one, where this module is loaded while cv2 is patched.
+    #: Bound once, so that a later patch of ``cv2.findFundamentalMat`` cannot call itself, nor an
+    #: earlier one of ours, where this module is loaded anew while cv2 is patched.
     original = getattr(cv2.findFundamentalMat, CV2S_OWN, cv2.findFundamentalMat)
 except AttributeError:
     raise ImportError(

@@ -338,7 +338,7 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
             if weight is not None:
                 reliability = with_scores(ranks(reliability), weight)
         if weight is not None or self.keep is not None:
-            n_kept = np.count_nonzero(support)
+            n_kept = int(np.count_nonzero(support))
             if self.keep is not None:
                 n_kept = max(1, round(self.keep * n))
             support = np.zeros(n, dtype=bool)
