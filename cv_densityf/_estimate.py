@@ -62,9 +62,11 @@ class Estimate:
         Inliers by the method's own rule.
     kept : array, shape (n,), bool
         The dense part: matches the density rule holds reliable. Of more than a thousand it looks at
-        a thousand, spread over both images, and at all where these lead to no agreement.
+        a thousand, spread over both images, and at all where these lead to no agreement. Where
+        cv2's own call answered, all finite matches.
     reliability : array, shape (n,), float64
-        From 0 (isolated) to 1 (densest); NaN for matches whose density was not looked at.
+        From 0 (isolated) to 1 (densest); NaN for matches whose density was not looked at. Where
+        cv2's own call answered, 1 for finite matches and 0 for others.
     n_draws : int
         Hypotheses drawn; 0 if cv2's own call answered.
     engine : str

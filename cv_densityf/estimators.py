@@ -365,6 +365,11 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
         -------
         ndarray
             ``support_``, or the indices of its true entries.
+
+        Raises
+        ------
+        sklearn.exceptions.NotFittedError
+            Before `fit`.
         """
         check_is_fitted(self)
         return self.sample_indices_ if indices else self.support_
@@ -383,6 +388,11 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
         -------
         ndarray of bool, shape (n,)
             ``support_``.
+
+        Raises
+        ------
+        ValueError
+            As `fit`.
         """
         return self.fit(X, y, sample_weight=sample_weight).support_
 
@@ -400,6 +410,11 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
         -------
         X_resampled, y_resampled
             The kept rows of each, of the type given; None for a ``y`` of None.
+
+        Raises
+        ------
+        ValueError
+            As `fit`.
         """
         rows = self.fit(X).sample_indices_
         return _safe_indexing(X, rows), None if y is None else _safe_indexing(y, rows)
@@ -595,6 +610,13 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         -------
         ndarray of bool, shape (n,)
             True for inliers, so that ``X[predict(X)]`` are the inliers.
+
+        Raises
+        ------
+        sklearn.exceptions.NotFittedError
+            Before `fit`.
+        ValueError
+            If X is not a finite array of four columns, or has other names of columns than in `fit`.
         """
         check_is_fitted(self)
         return self._inliers(self._validated(X, reset=False))
@@ -612,6 +634,13 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         ndarray of float, shape (n,)
             At most 0, higher is better; ``-inf`` where the distance is undefined, at an epipole,
             or too large for a float.
+
+        Raises
+        ------
+        sklearn.exceptions.NotFittedError
+            Before `fit`.
+        ValueError
+            If X is not a finite array of four columns, or has other names of columns than in `fit`.
         """
         check_is_fitted(self)
         return -self._residuals(self._validated(X, reset=False))
@@ -628,6 +657,13 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         -------
         ndarray of float, shape (n,)
             ``threshold_`` minus the residual, positive for inliers.
+
+        Raises
+        ------
+        sklearn.exceptions.NotFittedError
+            Before `fit`.
+        ValueError
+            If X is not a finite array of four columns, or has other names of columns than in `fit`.
         """
         check_is_fitted(self)
         return self.threshold_ - self._residuals(self._validated(X, reset=False))
@@ -646,6 +682,13 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         float
             Mean of ``max(0, 1 - (residual / threshold_)**2)``. It grows with the threshold: do
             not compare thresholds by it.
+
+        Raises
+        ------
+        sklearn.exceptions.NotFittedError
+            Before `fit`.
+        ValueError
+            If X is not a finite array of four columns, or has other names of columns than in `fit`.
         """
         check_is_fitted(self)
         residuals = self._residuals(self._validated(X, reset=False))

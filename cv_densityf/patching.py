@@ -162,7 +162,22 @@ def unpatch_cv2() -> None:
 
 
 def is_patched() -> bool:
-    """Whether ``cv2.findFundamentalMat`` is ours at the moment."""
+    """Whether ``cv2.findFundamentalMat`` is ours at the moment.
+
+    Returns
+    -------
+    bool
+        False, too, where somebody has patched over us.
+
+    Examples
+    --------
+    >>> from cv_densityf.patching import is_patched, patched
+    >>> with patched():
+    ...     is_patched()
+    True
+    >>> is_patched()
+    False
+    """
     return cv2.findFundamentalMat is findFundamentalMat
 
 
@@ -180,10 +195,27 @@ def patched(
     density, alpha, dc_percent
         As in `cv_densityf.findFundamentalMat`.
 
+    Yields
+    ------
+    None
+
     Raises
     ------
     ValueError
         For options that `cv_densityf.findFundamentalMat` refuses.
+
+    Examples
+    --------
+    >>> import cv2
+    >>> from cv_densityf import findFundamentalMat
+    >>> from cv_densityf.datasets import two_view_scene
+    >>> from cv_densityf.patching import patched
+    >>> scene = two_view_scene(200, random_state=0)
+    >>> with patched(density="paper"):
+    ...     F, mask = cv2.findFundamentalMat(scene.points1, scene.points2)
+    >>> expected, _ = findFundamentalMat(scene.points1, scene.points2, density="paper")
+    >>> bool((F == expected).all())
+    True
     """
     patch = _checked(density, alpha, dc_percent)
     with _lock:
@@ -199,7 +231,26 @@ def patched(
 
 
 def call_sites() -> list[CallSite]:
-    """Count what the patched function did, most calls first, since `reset_call_sites`."""
+    """Count what the patched function did, since `reset_call_sites`.
+
+    Returns
+    -------
+    list of CallSite
+        One for each calling line, most calls first.
+
+    Examples
+    --------
+    >>> import cv2
+    >>> from cv_densityf.datasets import two_view_scene
+    >>> from cv_densityf.patching import call_sites, patched, reset_call_sites
+    >>> reset_call_sites()
+    >>> scene = two_view_scene(200, random_state=0)
+    >>> with patched():
+    ...     for _ in range(3):
+    ...         F, mask = cv2.findFundamentalMat(scene.points1, scene.points2)
+    >>> [(site.calls, site.passed_on, site.kept + site.dropped) for site in call_sites()]
+    [(3, 0, 600)]
+    """
     with _lock:
         return sorted(_sites.values(), key=lambda site: -site.calls)
 
