@@ -36,7 +36,7 @@ from cv_densityf.matching import (
 )
 
 FOUND, NOT_FOUND, WRONG_USE = 0, 1, 2
-_MIN_MATCHES = 8
+_MIN_MATCHES = 7
 #: More points than this make a decision graph neither clearer nor quickly.
 _MAX_GRAPH_POINTS = 10_000
 _DEMO_ORDERS = 10
@@ -330,14 +330,6 @@ def _run_match(options: argparse.Namespace) -> int:
         with _stage("matching", timings):
             matches = match_features(*features, ratio=options.ratio)
         X, scores = matches.X, matches.scores
-    n_finite = int(finite_in_cv2(X).sum())
-    if n_finite < _MIN_MATCHES:
-        count = f"{n_finite} matches" if n_finite == len(X) else f"{n_finite} finite matches"
-        raise InputError(
-            f"{options.points or ' and '.join(options.images)}: {count}, a fundamental matrix "
-            f"needs at least {_MIN_MATCHES}"
-        )
-
     robust = Robust(
         method_flag(options.method), options.threshold, options.confidence, options.max_iters
     )
@@ -358,6 +350,9 @@ def _run_match(options: argparse.Namespace) -> int:
     if options.method != "usac_accurate" or len(X) <= GRAPH_CUT_MAX:
         with _stage("plain cv2", timings):
             plain = robust.plain(X[:, :2], X[:, 2:])
+    n_finite = int(finite_in_cv2(X).sum())
+    if options.plot is not None and estimate.F is not None and len(estimate.F) > 3:
+        raise InputError("seven matches fit several matrices, and --plot draws the lines of one")
     report = {
         "method": options.method,
         "threshold": options.threshold,
@@ -366,6 +361,10 @@ def _run_match(options: argparse.Namespace) -> int:
     print(json.dumps(report, allow_nan=False) if options.json else _for_people(report))
     if report["F"] is None:
         reason = "cv2's numbers are not finite" if estimate else estimate.reason
+        if n_finite < _MIN_MATCHES:
+            source = options.points or " and ".join(options.images)
+            finite = "" if n_finite == len(X) else "finite "
+            reason = f"{source}: {n_finite} {finite}matches, at least {_MIN_MATCHES} are needed"
         return _complain(f"no fundamental matrix found: {reason}", NOT_FOUND)
     if options.output is not None:
         _write(options.output, X, scores, estimate, report)
@@ -447,8 +446,9 @@ def _for_people(report: dict[str, Any]) -> str:
     named = ", ".join(f"{name} {value:.1f}" for name, value in stages.items())
     lines.append(f"{'stages, ms':<22}  {named}")
     if report["F"] is not None:
-        lines += ["", "F"]
-        lines += ["  " + "".join(f"{value:>18.9e}" for value in row) for row in report["F"]]
+        rows_of_F = ["  " + "".join(f"{value:>18.9e}" for value in row) for row in report["F"]]
+        for first in range(0, len(rows_of_F), 3):
+            lines += ["", "F", *rows_of_F[first : first + 3]]
     return "\n".join(lines)
 
 
