@@ -370,7 +370,9 @@ def _run_match(options: argparse.Namespace) -> int:
         _write(options.output, X, scores, estimate, report)
     if options.plot is not None:
         with _stage("drawing", timings):
-            _draw(options.plot, images, X, estimate, options.alpha)
+            by_paper = options.density == "paper" and estimate.engine == "density"
+            alpha = options.alpha if by_paper else None
+            _draw(options.plot, images, X, estimate, alpha)
     # Such as that a JPEG file is damaged, but was of use.
     sys.stderr.writelines(words)
     return FOUND
@@ -492,12 +494,14 @@ def _draw(
     images: tuple[NDArray[Any] | None, NDArray[Any] | None],
     X: Floats,
     estimate: Estimate,
-    alpha: float,
+    alpha: float | None,
 ) -> None:
     from cv_densityf import plotting
 
     rows = np.flatnonzero(finite_in_cv2(X))
-    rows = rows[:: max(1, -(-len(rows) // _MAX_GRAPH_POINTS))]
+    n_finite = len(rows)
+    step = max(1, -(-len(rows) // _MAX_GRAPH_POINTS))
+    rows = rows[::step]
     figure = plotting.summary_figure(
         *images,
         X[rows],
@@ -507,6 +511,8 @@ def _draw(
         peaks=density_peaks(X[rows]),
         alpha=alpha,
     )
+    if step > 1:
+        figure.suptitle(f"1 in {step} of {n_finite} matches shown", fontsize=13)
     with replacing(path) as temporary:
         figure.savefig(temporary)
 

@@ -1,8 +1,8 @@
 """Pictures of matches and of what was made of them, with matplotlib.
 
 Every function draws into the axes it is given, or into those of a new figure, and returns them.
-The colours are Okabe and Ito's, which colour-blind readers tell apart; where a difference
-matters, marker shapes or numbers show it as well.
+The colours of matches are Okabe and Ito's, which colour-blind readers tell apart; where a
+difference matters, marker shapes or numbers show it as well.
 """
 
 from __future__ import annotations
@@ -20,7 +20,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442")
+#: Okabe and Ito's seven colours, then two of Tol's and white: as many as there are lines.
+_LINE_COLORS = (
+    *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442"),
+    *("#332288", "#882255", "#FFFFFF"),
+)
 #: Between two images, as a share of the first one's width.
 _GAP = 0.02
 
@@ -50,14 +54,14 @@ _STYLES = {
     (False, False): _Style("dropped", "#333333", ".", 0.6, 2),
     (True, False): _Style("kept, not an inlier", "#D55E00", "x", 0.9, 3),
     (True, True): _Style("kept, inlier", "#0072B2", "o", 0.9, 4),
-    (False, True): _Style("dropped, yet inlier", "#E69F00", "^", 1.0, 5),
+    (False, True): _Style("dropped, yet inlier", "#56B4E9", "^", 1.0, 5),
 }
 
 
 def plot_decision_graph(
     peaks: _Peaks,
     *,
-    alpha: float = 0.011,
+    alpha: float | None = None,
     kept: ArrayLike | None = None,
     mask: ArrayLike | None = None,
     ax: Axes | None = None,
@@ -68,10 +72,11 @@ def plot_decision_graph(
     ----------
     peaks : DensityPeaksResult
         From `cv_densityf.density_peaks`; anything with ``rho`` and ``delta``, each (n,).
-    alpha : float
-        The curve is where rho * delta = alpha * max(rho) * max(delta).
+    alpha : float, optional
+        Of ``density="paper"``, whose curve rho * delta = alpha * max(rho) * max(delta) is then
+        drawn; other rules have none.
     kept : (n,) array of bool, optional
-        Matches of the dense part; by default those on or above the curve.
+        Matches of the dense part; by default those on or above the curve, all without one.
     mask : (n,) array of bool, optional
         Inliers of the final fundamental matrix; by default they are not told apart.
     ax : matplotlib.axes.Axes, optional
@@ -104,7 +109,7 @@ def plot_decision_graph(
     'rho, density: matches closer than the cut-off distance'
     """
     rho, delta = np.asarray(peaks.rho), np.asarray(peaks.delta)
-    product = alpha * rho.max(initial=0) * delta.max(initial=0)
+    product = (alpha or 0.0) * rho.max(initial=0) * delta.max(initial=0)
     on_or_above: NDArray[np.bool_] = rho * delta >= product
     kept = on_or_above if kept is None else _mask(kept, len(rho), "kept")
     mask = None if mask is None else _mask(mask, len(rho), "mask")
@@ -118,13 +123,14 @@ def plot_decision_graph(
         )  # fmt: skip
         handles.append(handle)
     ax.set_yscale("symlog", linthresh=1)
-    if product > 0:
+    if rho.max(initial=0) > 0 and delta.max() > 0:
         top, right = 1.5 * delta.max(), 1.03 * rho.max()
         bottom = 0.7 * delta.min() if delta.min() > 0 else -0.2
-        x = np.geomspace(product / top, right, 400)
-        label = f"rho x delta = {alpha:g} x max rho x max delta"
-        handles += ax.plot(x, product / x, color="black", lw=1.6, ls="--", zorder=6, label=label)
         ax.set(xlim=(-0.02 * right, right), ylim=(bottom, top))
+        if product > 0:
+            x = np.geomspace(product / top, right, 400)
+            label = f"rho x delta = {alpha:g} x max rho x max delta"
+            handles += ax.plot(x, product / x, "k--", lw=1.6, zorder=6, label=label)
     ax.set_xlabel("rho, density: matches closer than the cut-off distance")
     ax.set_ylabel("delta, distance to a denser match (px)")
     ax.grid(alpha=0.25)
@@ -268,7 +274,7 @@ def plot_epipolar_lines(
     ax = _axes(ax, (16, 6))
     places = _show(ax, image1, image2, X[finite])
     for number, row in enumerate(_far_apart(X, np.flatnonzero(mask & finite), n_lines)):
-        color = _OKABE_ITO[number % len(_OKABE_ITO)]
+        color = _LINE_COLORS[number % len(_LINE_COLORS)]
         point1, point2 = X[row, :2], X[row, 2:]
         lines = (F.T @ [*point2, 1], F @ [*point1, 1])
         for point, line, place in zip((point1, point2), lines, places, strict=True):
@@ -295,7 +301,7 @@ def summary_figure(
     kept: ArrayLike,
     mask: ArrayLike,
     peaks: _Peaks,
-    alpha: float = 0.011,
+    alpha: float | None = None,
 ) -> Figure:
     """Draw matches, epipolar lines and decision graph below each other, 1600 pixels wide.
 
@@ -311,8 +317,8 @@ def summary_figure(
         Matches of the dense part, and inliers of ``F``.
     peaks : DensityPeaksResult
         Density peaks of ``X``.
-    alpha : float
-        Of the curve in the decision graph.
+    alpha : float, optional
+        Of ``density="paper"``, for its curve in the decision graph.
 
     Returns
     -------

@@ -16,6 +16,7 @@ from cv_densityf.__main__ import main
 from cv_densityf._epipolar import inlier_mask, residuals, sampson_distance
 from cv_densityf._estimate import estimate_fundamental
 from cv_densityf.datasets import motorcycle, two_view_scene
+from cv_densityf.plotting import new_figure
 
 SCENE = two_view_scene(400, inlier_ratio=0.5)
 
@@ -48,6 +49,19 @@ def run(capfd):
         return (code, *capfd.readouterr())
 
     return run
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    """Figures that are drawn."""
+    made = []
+
+    def spy(*size):
+        made.append(new_figure(*size))
+        return made[-1]
+
+    monkeypatch.setattr("cv_densityf.plotting.new_figure", spy)
+    return made
 
 
 @pytest.fixture
@@ -201,6 +215,28 @@ def test_matching_options(run, photos):
 def test_points_can_be_drawn_without_images(run, npz, tmp_path):
     assert run("match", "--points", npz, "--plot", tmp_path / "plot.png")[0] == 0
     assert cv2.imread(str(tmp_path / "plot.png")).shape[1] == 1600
+
+
+@pytest.mark.parametrize(("limit", "shown"), [(400, ""), (150, "1 in 3 of 400 matches shown")])
+def test_a_plot_of_a_part_says_so(run, npz, tmp_path, figures, monkeypatch, limit, shown):
+    monkeypatch.setattr("cv_densityf.__main__._MAX_GRAPH_POINTS", limit)
+    assert run("match", "--points", npz, "--plot", tmp_path / "plot.png")[0] == 0
+    assert figures[0].get_suptitle() == shown
+
+
+@pytest.mark.parametrize(
+    ("options", "curves"),
+    [
+        ((), 0),
+        (("--density", "off"), 0),
+        (("--density", "paper"), 1),
+        (("--density", "paper", "--method", "8point"), 0),
+    ],
+)
+def test_the_papers_curve_is_of_the_papers_rule(run, npz, tmp_path, figures, options, curves):
+    assert run("match", "--points", npz, "--plot", tmp_path / "plot.png", *options)[0] == 0
+    labels = [line.get_label() for line in figures[0].axes[2].lines]
+    assert sum("rho x delta" in label for label in labels) == curves
 
 
 def test_stages_are_shown_on_a_terminal_only(run, npz, monkeypatch):

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from cv_densityf.datasets import two_view_scene
@@ -72,6 +73,10 @@ class TestDecisionGraph:
         assert x.max() >= 9
         assert y.max() >= 80
 
+    def test_no_curve_where_none_is_the_rule(self, ax):
+        plot_decision_graph(PEAKS, ax=ax)
+        assert drawn(ax) == {"kept (5)": 5}
+
     def test_curve_parts_kept_from_dropped_by_default(self, ax):
         plot_decision_graph(PEAKS, alpha=0.05, ax=ax)
         product = PEAKS.rho * PEAKS.delta
@@ -79,8 +84,9 @@ class TestDecisionGraph:
         assert drawn(ax)[f"kept ({kept})"] == kept
         assert drawn(ax)[f"dropped ({5 - kept})"] == 5 - kept
 
-    def test_every_point_is_in_view(self, ax):
-        plot_decision_graph(PEAKS, ax=ax)
+    @pytest.mark.parametrize("alpha", [None, 0.011])
+    def test_every_point_is_in_view(self, ax, alpha):
+        plot_decision_graph(PEAKS, alpha=alpha, ax=ax)
         (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
         assert left < PEAKS.rho.min()
         assert right > PEAKS.rho.max()
@@ -89,7 +95,8 @@ class TestDecisionGraph:
 
     @pytest.mark.parametrize("n", [0, 1, 4])
     def test_nothing_to_tell(self, ax, n):
-        plot_decision_graph(SimpleNamespace(rho=np.zeros(n), delta=np.zeros(n)), ax=ax)
+        peaks = SimpleNamespace(rho=np.zeros(n), delta=np.zeros(n))
+        plot_decision_graph(peaks, alpha=0.011, ax=ax)
         ax.figure.canvas.draw()
 
     @pytest.mark.parametrize("name", ["kept", "mask"])
@@ -112,6 +119,15 @@ class TestMatches:
             # Each match has a point in both images.
             assert sets[f"{label} ({rows.sum()})"] == 2 * rows.sum()
         assert set(legend(ax)) == set(sets)
+
+    def test_colors_of_inliers_and_others_differ_for_all_eyes(self, ax):
+        plot_matches(None, None, SCENE.X, np.arange(60) < 40, SCENE.inliers, ax=ax)
+        lines = [line for line in ax.lines if not line.get_label().startswith("_")]
+        rgb = {line.get_label().split(" (")[0]: to_rgb(line.get_color()) for line in lines}
+        # Without red or without green, blue and lightness are what is left.
+        wrong = np.array(rgb["kept, not an inlier"])
+        for right in ("kept, inlier", "dropped, yet inlier"):
+            assert rgb[right][2] - wrong[2] > 0.5
 
     def test_points_lie_on_their_images(self, ax):
         # The second image is shown as high as the first, twice its size.
@@ -202,6 +218,12 @@ class TestEpipolarLines:
             assert x.max() < right + 1e-6
             assert y.min() > top - 1e-6
             assert y.max() < bottom + 1e-6
+
+    def test_ten_lines_have_ten_colors(self, ax):
+        plot_epipolar_lines(IMAGE, IMAGE, SCENE.X, SCENE.F, n_lines=10, ax=ax)
+        points = [line for line in ax.lines if line.get_marker() == "o"]
+        assert len(points) == 20
+        assert len({line.get_color() for line in points}) == 10
 
     def test_only_inliers_are_drawn(self, ax):
         mask = np.zeros(60, bool)

@@ -69,8 +69,8 @@ ax.legend(frameon=False, loc="lower right")
 
 # %%
 # What happened in between is told by :func:`cv_densityf.estimate_fundamental`, the same estimate
-# without cv2's shapes. Blue and orange matches agree with the result; the orange ones are outside
-# the dense part, in which the search began.
+# without cv2's shapes. Blue matches agree with the result; the light ones are outside the dense
+# part, in which the search began.
 
 estimate = cv_densityf.estimate_fundamental(points1, points2)
 print(estimate.reason)
