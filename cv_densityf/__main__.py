@@ -23,7 +23,13 @@ import cv_densityf
 from cv_densityf._density import density_peaks
 from cv_densityf._engine import GRAPH_CUT_MAX, METHODS, Robust, method_flag
 from cv_densityf._epipolar import Floats, residuals
-from cv_densityf._estimate import DENSITIES, Estimate, estimate_fundamental, finite_in_cv2
+from cv_densityf._estimate import (
+    DENSITIES,
+    MIN_FILTERED,
+    Estimate,
+    estimate_fundamental,
+    finite_in_cv2,
+)
 from cv_densityf._files import InputError, read_matches, replacing
 from cv_densityf._run_script import add_run, run_script
 from cv_densityf.matching import (
@@ -37,6 +43,9 @@ from cv_densityf.matching import (
 
 FOUND, NOT_FOUND, WRONG_USE = 0, 1, 2
 _MIN_MATCHES = 7
+#: Each method is timed this often, unless that takes longer than so many milliseconds.
+_TIMED_TURNS = 3
+_LONG = 1000.0
 #: More points than this make a decision graph neither clearer nor quickly.
 _MAX_GRAPH_POINTS = 10_000
 _DEMO_ORDERS = 10
@@ -333,8 +342,8 @@ def _run_match(options: argparse.Namespace) -> int:
     robust = Robust(
         method_flag(options.method), options.threshold, options.confidence, options.max_iters
     )
-    with _stage("estimating", timings):
-        estimate = estimate_fundamental(
+    calls: dict[str, Callable[[], Any]] = {
+        "estimating": lambda: estimate_fundamental(
             X[:, :2],
             X[:, 2:],
             method=options.method,
@@ -346,11 +355,21 @@ def _run_match(options: argparse.Namespace) -> int:
             scores=scores,
             random_state=options.seed,
         )
-    plain = None
-    if options.method != "usac_accurate" or len(X) <= GRAPH_CUT_MAX:
-        with _stage("plain cv2", timings):
-            plain = robust.plain(X[:, :2], X[:, 2:])
+    }
     n_finite = int(finite_in_cv2(X).sum())
+    same_call = n_finite == len(X) and (
+        options.density == "off"
+        or options.method in ("7point", "8point")
+        or n_finite < MIN_FILTERED
+    )
+    compared = options.method != "usac_accurate" or len(X) <= GRAPH_CUT_MAX
+    if compared and not same_call:
+        calls["plain cv2"] = lambda: robust.plain(X[:, :2], X[:, 2:])
+    with _stage("estimating", timings):
+        results, processor = _timed(calls)
+    timings.update(processor)
+    estimate = results["estimating"]
+    plain = (estimate.F, estimate.mask) if compared and same_call else results.get("plain cv2")
     if options.plot is not None and estimate.F is not None and len(estimate.F) > 3:
         raise InputError("seven matches fit several matrices, and --plot draws the lines of one")
     report = {
@@ -376,6 +395,24 @@ def _run_match(options: argparse.Namespace) -> int:
     # Such as that a JPEG file is damaged, but was of use.
     sys.stderr.writelines(words)
     return FOUND
+
+
+def _timed(calls: dict[str, Callable[[], Any]]) -> tuple[dict[str, Any], dict[str, float]]:
+    """Results of the calls, and the processor time of each in milliseconds.
+
+    They take turns, so that a busy moment hits all. The first turn pays for what is set up only
+    once, and counts only where it takes so long that this does not matter.
+    """
+    results: dict[str, Any] = {}
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(1 + _TIMED_TURNS):
+        for name, call in calls.items():
+            start = time.process_time()
+            results[name] = call()
+            times[name].append(1e3 * (time.process_time() - start))
+        if sum(map(sum, times.values())) > _LONG:
+            break
+    return results, {name: float(np.median(each[1:] or each)) for name, each in times.items()}
 
 
 def _report(
@@ -431,22 +468,27 @@ def _median_residual(F: Floats | None, X: Floats, robust: Robust) -> float | Non
 def _for_people(report: dict[str, Any]) -> str:
     times = report["timings_ms"]
     ours = [report["n_kept"], *_result(report), f"{times['estimating']:.1f}"]
-    plain = ["-", "not run", "-", "-"]
-    if report["cv2"] is not None:
-        plain = [report["n_matches"], *_result(report["cv2"]), f"{times['plain cv2']:.1f}"]
-    names = ["kept as dense", "inliers", "median residual, px", "time, ms"]
+    names = ["kept as dense", "inliers", "median residual, px", "processor time, ms"]
     lines = [
         f"{report['n_matches']} matches, {report['method']}, threshold {report['threshold']:g} px",
         "",
-        f"{'':<22}{'cv-densityf':>12}{'plain cv2':>12}",
     ]
-    lines += [f"{name:<22}{a:>12}{b:>12}" for name, a, b in zip(names, ours, plain, strict=True)]
+    if report["cv2"] is not None and "plain cv2" not in times:
+        lines.append(f"{'':<22}{'plain cv2':>12}")
+        lines += [f"{name:<22}{a:>12}" for name, a in zip(names[1:], ours[1:], strict=True)]
+    else:
+        plain = ["-", "not run", "-", "-"]
+        if report["cv2"] is not None:
+            plain = [report["n_matches"], *_result(report["cv2"]), f"{times['plain cv2']:.1f}"]
+        lines.append(f"{'':<22}{'cv-densityf':>12}{'plain cv2':>12}")
+        rows = zip(names, ours, plain, strict=True)
+        lines += [f"{name:<22}{a:>12}{b:>12}" for name, a, b in rows]
     stages = {
         **{name: times[name] for name in ("reading", "features", "matching") if name in times},
         **times["estimating_stages"],
     }
     named = ", ".join(f"{name} {value:.1f}" for name, value in stages.items())
-    lines.append(f"{'stages, ms':<22}  {named}")
+    lines.append(f"{'elapsed, ms':<22}  {named}")
     if report["F"] is not None:
         rows_of_F = ["  " + "".join(f"{value:>18.9e}" for value in row) for row in report["F"]]
         for first in range(0, len(rows_of_F), 3):
@@ -528,28 +570,36 @@ def _run_demo(options: argparse.Namespace) -> int:
     with _stage("matching", timings):
         matches = match_images(pair.image1, pair.image2)
     X = matches.X
+    right = np.mean(residuals(pair.F, X, "usac") <= 1)
     print(
         f"Middlebury's pair 'motorcycle', the second image turned by a known homography:\n"
         f"{len(X)} SIFT matches, mutual nearest neighbours, no ratio test. Threshold 1 px.\n"
+        f"An easy pair: {right:.0%} of the matches are right.\n"
         f"Error: mean distance of {len(pair.points1)} true correspondences to the epipolar lines,\n"
         f"over {_DEMO_ORDERS} orders of the matches (cv2's results depend on the order).\n"
+        f"The truth is known to a tenth of a pixel: smaller errors are as good as each other.\n"
     )
-    print(f"{'':<34}{'error, px':>20}{'inliers':>10}{'time, ms':>10}")
-    print(f"{'':<34}{'median':>10}{'worst':>10}{'median':>10}{'median':>10}")
-    orders = [np.random.default_rng(seed).permutation(len(X)) for seed in range(_DEMO_ORDERS)]
-    for name, estimate in _demo_estimators():
-        with _stage(name, timings):
-            results = []
-            for order in orders:
-                start = time.perf_counter()
+    print(f"{'':<26}{'error, px':>20}{'inliers':>10}{'processor time, ms':>20}")
+    print(f"{'':<26}{'median':>10}{'worst':>10}{'median':>10}{'median':>20}")
+    estimators = dict(_demo_estimators())
+    results: dict[str, list[tuple[float, int, float]]] = {name: [] for name in estimators}
+    with _stage("comparing", timings):
+        for estimate in estimators.values():
+            estimate(X, matches.scores)  # what is set up only once is nobody's time
+        # In turn, so that a busy moment hits all.
+        for seed in range(_DEMO_ORDERS):
+            order = np.random.default_rng(seed).permutation(len(X))
+            for name, estimate in estimators.items():
+                start = time.process_time()
                 F, mask = estimate(X[order], matches.scores[order])
-                elapsed = 1e3 * (time.perf_counter() - start)
+                elapsed = 1e3 * (time.process_time() - start)
                 error = float("inf") if F is None else pair.error(F)
-                results.append((error, int(np.sum(mask)), elapsed))
-        errors, inliers, times = np.array(results).T
+                results[name].append((error, int(np.sum(mask)), elapsed))
+    for name, each in results.items():
+        errors, inliers, times = np.array(each).T
         print(
-            f"{name:<34}{np.median(errors):>10.3f}{errors.max():>10.3f}"
-            f"{np.median(inliers):>10.0f}{np.median(times):>10.1f}"
+            f"{name:<26}{np.median(errors):>10.3f}{errors.max():>10.3f}"
+            f"{np.median(inliers):>10.0f}{np.median(times):>20.1f}"
         )
     found = estimate_fundamental(matches.points1, matches.points2)
     if found.F is None:

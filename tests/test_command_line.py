@@ -156,9 +156,51 @@ def test_people_read_the_same_numbers(run, npz):
         ),
     ):
         assert re.search(rf"^{line} +{ours} +{plain}$", text, re.MULTILINE)
-    assert re.search(r"^time, ms +[\d.]+ +[\d.]+$", text, re.MULTILINE)
+    assert re.search(r"^processor time, ms +[\d.]+ +[\d.]+$", text, re.MULTILINE)
     numbers = [float(word) for word in text.split("\nF\n")[1].split()]
     np.testing.assert_allclose(numbers, np.ravel(report["F"]), rtol=1e-8)
+
+
+def test_methods_are_timed_warm_and_in_turn(run, npz, monkeypatch):
+    called, clock = [], iter(range(100))
+    monkeypatch.setattr("time.process_time", lambda: next(clock) / 100)
+
+    def ours(*arguments, **options):
+        called.append("ours")
+        if len(called) == 1:
+            [next(clock) for _ in range(20)]  # what the first call sets up
+        return estimate_fundamental(*arguments, **options)
+
+    def plain(self, *points):
+        called.append("cv2")
+        return cv2.findFundamentalMat(*points)
+
+    monkeypatch.setattr("cv_densityf.__main__.estimate_fundamental", ours)
+    monkeypatch.setattr("cv_densityf._engine.Robust.plain", plain)
+    times = json.loads(run("match", "--points", npz, "--json")[1])["timings_ms"]
+    assert called == ["ours", "cv2"] * 4
+    assert times["estimating"] == times["plain cv2"] == 10
+
+
+def test_long_calls_are_made_once(run, npz, asked, monkeypatch):
+    clock = iter(range(100))
+    monkeypatch.setattr("time.process_time", lambda: next(clock))
+    times = json.loads(run("match", "--points", npz, "--json")[1])["timings_ms"]
+    assert len(asked) == 1
+    assert times["estimating"] == 1000
+
+
+@pytest.mark.parametrize("options", [("--density", "off"), ("--method", "8point")])
+def test_the_same_call_is_shown_once(run, npz, options):
+    report = json.loads(run("match", "--points", npz, "--json", *options)[1])
+    flag = cv2.FM_8POINT if "8point" in options else cv2.USAC_ACCURATE
+    F, mask = cv2.findFundamentalMat(SCENE.points1, SCENE.points2, flag, 1.0, 0.999, 5000)
+    np.testing.assert_array_equal(report["cv2"]["F"], F)
+    assert report["cv2"]["n_inliers"] == report["n_inliers"] == mask.sum()
+    assert "plain cv2" not in report["timings_ms"]
+    text = run("match", "--points", npz, *options)[1]
+    assert re.search(r"\n\n +plain cv2\ninliers +\d+\n", text)
+    assert re.search(r"^processor time, ms +[\d.]+$", text, re.MULTILINE)
 
 
 def test_output_npz_can_be_read_back(run, npz, tmp_path):
@@ -409,7 +451,7 @@ def test_more_matches_than_cv2_survives(run, tmp_path):
     assert "not run" in out
 
 
-def test_demo_needs_no_network(run, tmp_path, monkeypatch):
+def test_demo_needs_no_network(run, tmp_path, figures, monkeypatch):
     monkeypatch.setattr(socket, "socket", lambda *arguments: pytest.fail("opened a socket"))
     monkeypatch.setattr("cv_densityf.__main__._DEMO_ORDERS", 2)
     code, out, err = run("demo", "--out", tmp_path / "new" / "folder")
@@ -424,10 +466,32 @@ def test_demo_needs_no_network(run, tmp_path, monkeypatch):
     }
     assert all(0 < float(error) < 2 for error in errors.values())
     assert float(errors["cv-densityf"]) < 0.3
+    assert "processor time, ms" in out
+    assert re.search(r"An easy pair: 7\d% of the matches are right", out)
+    assert "known to a tenth of a pixel" in out
+    assert not any("rho x delta" in line.get_label() for f in figures for line in f.axes[0].lines)
     for name in ("matches", "epipolar_lines", "decision_graph"):
         path = tmp_path / "new" / "folder" / f"{name}.png"
         assert str(path) in out
         assert cv2.imread(str(path)).shape[1] == 1600
+
+
+def test_demo_times_its_methods_in_turn(run, tmp_path, monkeypatch):
+    called = []
+
+    def method(name):
+        def estimate(X, scores):
+            called.append(name)
+            return np.eye(3), np.ones(len(X))
+
+        return estimate
+
+    monkeypatch.setattr("cv_densityf.__main__._DEMO_ORDERS", 2)
+    monkeypatch.setattr(
+        "cv_densityf.__main__._demo_estimators", lambda: [(n, method(n)) for n in "ab"]
+    )
+    assert run("demo", "--out", tmp_path)[0] == 0
+    assert called == ["a", "b"] * 3
 
 
 def test_version(run):
