@@ -87,7 +87,7 @@ def compat(session: nox.Session, opencv: str, numpy: str) -> None:
 @nox.session
 @releases(pythons=slice(1))
 def tests(session: nox.Session, opencv: str, numpy: str) -> None:
-    """Run the tests that touch cv2."""
+    """Run the tests of what depends most on the release: points, masks and the function."""
     install(session, opencv, numpy)
     files = ("points", "epipolar_masks", "cv2_api")
     session.run(
