@@ -195,7 +195,8 @@ def _add_match(commands: argparse._SubParsersAction[Any]) -> None:
         "--density",
         choices=DENSITIES,
         default="contrast",
-        help="how the dense matches are chosen (%(default)s)",
+        help="how the dense matches are chosen (%(default)s; paper is there for comparison: slower "
+        "and less accurate)",
     )
     estimate.add_argument(
         "--alpha", metavar="A", type=_ALPHA, default=0.011, help="of --density paper (%(default)s)"

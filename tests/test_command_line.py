@@ -6,6 +6,7 @@ import re
 import socket
 import subprocess
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -230,6 +231,14 @@ def test_output_json_holds_the_matches_too(run, tmp_path):
     assert found["points1"][4] == points1[4].tolist()
     assert found["mask"][3] is False
     assert sum(found["mask"]) == found["n_inliers"]
+
+
+def test_the_page_names_every_key(run, npz, tmp_path):
+    page = (Path(__file__).parents[1] / "docs" / "command-line.md").read_text("utf-8")
+    out, report = tmp_path / "out.json", json.loads(run("match", "--points", npz, "--json")[1])
+    run("match", "--points", npz, "-o", out)
+    for key in {*json.loads(out.read_text()), *report, *report["timings_ms"], *report["cv2"]}:
+        assert f"`{key}`" in page
 
 
 def test_two_images(run, photos, tmp_path):
