@@ -87,9 +87,9 @@ def compat(session: nox.Session, opencv: str, numpy: str) -> None:
 @nox.session
 @releases(pythons=slice(1))
 def tests(session: nox.Session, opencv: str, numpy: str) -> None:
-    """Run the tests of what depends most on the release: points, masks and the function."""
+    """Run the tests of what calls this cv2: draws, trees, masks, pipeline and the function."""
     install(session, opencv, numpy)
-    files = ("points", "epipolar_masks", "cv2_api")
+    files = ("points", "epipolar_masks", "prefilter", "consensus", "estimate", "cv2_api")
     session.run(
         *("python", "-m", "pytest", "-q"),
         *(f"tests/test_{name}.py" for name in files),

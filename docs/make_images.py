@@ -22,7 +22,7 @@ from cv_densityf.datasets import motorcycle
 from cv_densityf.matching import match_images
 from cv_densityf.plotting import plot_decision_graph, plot_epipolar_lines, plot_matches
 
-BLUE, ORANGE, RED, DARK = "#0072B2", "#E69F00", "#D55E00", "#333333"
+BLUE, ORANGE, RED, DARK, SKY = "#0072B2", "#E69F00", "#D55E00", "#333333", "#56B4E9"
 #: A match is taken for right when it is this near to the known epipolar geometry, pixels.
 RIGHT = 1.0
 
@@ -174,7 +174,7 @@ def mask(grey: np.ndarray, X: np.ndarray, kept: np.ndarray, inliers: np.ndarray)
             "in the end",
             [
                 ("kept, inlier", kept & inliers, BLUE, "o"),
-                ("dropped, yet inlier", ~kept & inliers, ORANGE, "^"),
+                ("dropped, yet inlier", ~kept & inliers, SKY, "^"),
                 ("kept, not an inlier", kept & ~inliers, RED, "x"),
             ],
         ),
