@@ -160,10 +160,12 @@ class Frame:
 
     def errors(self, G: Floats) -> tuple[Floats, Floats]:
         """Algebraic error and squared gradient norm of each match under each matrix, (m, n)."""
-        algebraic, norm = np.empty((2, len(G), self.products.shape[1]))
-        for part in self._parts(9 * len(G)):
-            lines2 = G[:, :2] @ self.homogeneous1[:, part]
-            lines1 = G.transpose(0, 2, 1)[:, :2] @ self.homogeneous2[:, part]
+        m = len(G)
+        algebraic, norm = np.empty((2, m, self.products.shape[1]))
+        rows, columns = G[:, :2].reshape(-1, 3), G[:, :, :2].transpose(0, 2, 1).reshape(-1, 3)
+        for part in self._parts(9 * m):
+            lines2 = (rows @ self.homogeneous1[:, part]).reshape(m, 2, -1)
+            lines1 = (columns @ self.homogeneous2[:, part]).reshape(m, 2, -1)
             np.einsum("mkn,mkn->mn", lines2, lines2, out=norm[:, part])
             norm[:, part] += np.einsum("mkn,mkn->mn", lines1, lines1)
             np.matmul(G.reshape(-1, 9), self.products[:, part], out=algebraic[:, part])

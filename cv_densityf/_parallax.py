@@ -18,6 +18,8 @@ _STEPS = 3
 #: Pairs of matches tried, and how many of the hypotheses through them are worth a polish.
 _PAIRS = 512
 _BEST = 2
+#: Matches off the plane that are asked which these are.
+_JUDGES = 128
 
 
 def plane_and_parallax(
@@ -73,6 +75,8 @@ def plane_and_parallax(
     hypotheses = np.cross(through[first], through[second]) @ family.T
     hypotheses = hypotheses.reshape(-1, 3, 3)
     hypotheses /= np.linalg.norm(hypotheses, axis=(1, 2), keepdims=True)
-    squared = frame.part(off_plane).sampson(hypotheses)
+    judges = np.zeros_like(off_plane)
+    judges[rng.permutation(np.flatnonzero(off_plane))[:_JUDGES]] = True
+    squared = frame.part(judges).sampson(hypotheses)
     votes = np.maximum(0.0, 1.0 - squared / width**2).sum(axis=1)
     return hypotheses[np.argsort(-votes, kind="stable")[:_BEST]], off_plane
