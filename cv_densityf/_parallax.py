@@ -57,7 +57,8 @@ def plane_and_parallax(
     off_plane : array, shape (n,)
         The matches that are not on it.
     """
-    _, norm = frame.errors(G[None])
+    norm = frame.errors(G[None])[1]
+    norm = np.maximum(norm, 0.01 * norm.mean())  # it is 0 for a match of the two epipoles
     plane: Floats = inliers.astype(np.float64)
     for _ in range(_STEPS):
         family = np.linalg.eigh(frame.gram(plane / norm))[1][0, :, :3]
@@ -72,11 +73,12 @@ def plane_and_parallax(
     first = rng.integers(n, size=_PAIRS)
     second = (first + rng.integers(1, n, size=_PAIRS)) % n
     through = coordinates[:, off_plane].T
-    hypotheses = np.cross(through[first], through[second]) @ family.T
-    hypotheses = hypotheses.reshape(-1, 3, 3)
-    hypotheses /= np.linalg.norm(hypotheses, axis=(1, 2), keepdims=True)
+    hypotheses = (np.cross(through[first], through[second]) @ family.T).reshape(-1, 3, 3)
+    with np.errstate(invalid="ignore"):
+        hypotheses /= np.linalg.norm(hypotheses, axis=(1, 2), keepdims=True)
     judges = np.zeros_like(off_plane)
     judges[rng.permutation(np.flatnonzero(off_plane))[:_JUDGES]] = True
     squared = frame.part(judges).sampson(hypotheses)
     votes = np.maximum(0.0, 1.0 - squared / width**2).sum(axis=1)
-    return hypotheses[np.argsort(-votes, kind="stable")[:_BEST]], off_plane
+    best = np.argsort(-votes, kind="stable")[:_BEST]
+    return hypotheses[best[votes[best] > 0]], off_plane  # copies of one match fix no F

@@ -98,3 +98,16 @@ def test_the_same_seed_tries_the_same_pairs():
     first, again, otherwise = (completed(X, other, seed=seed)[0] for seed in (3, 3, 4))
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, otherwise)
+
+
+def test_copies_of_one_match_off_the_plane_fix_nothing():
+    X, _, other = scene(0, off=1, wrong=0)
+    X = np.vstack([X, np.repeat(X[-1:], 9, axis=0)])
+    assert len(completed(X, other)[0]) == 0
+
+
+def test_a_match_of_the_two_epipoles_is_no_matter():
+    X, _, other = scene(0)
+    ends = [np.linalg.svd(F)[2][2] for F in (other, other.T)]
+    X = np.vstack([X, np.hstack([e[:2] / e[2] for e in ends])])
+    assert np.median(sampson_distance(completed(X, other)[0][0], X[300:312])) < 1e-6
