@@ -1,4 +1,4 @@
-"""``python -m benchmarks real | synthetic | stages | scale | paper | reliability``."""
+"""``python -m benchmarks real | render | synthetic | stages | scale | paper | reliability``."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from benchmarks import report
 from benchmarks.data import Pair, load_pairs
+from benchmarks.motions import write_pairs
 from benchmarks.paper import reproduce
 from benchmarks.peers import METHODS, Method, Settings, choose
 from benchmarks.run import Record, measure, one_thread, warm_up
@@ -68,6 +69,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     real.add_argument("--sets", nargs="+", metavar="SET", help="only these sets")
     real.set_defaults(run=_real)
+
+    render = commands.add_parser("render", help="write rendered pairs, as data for real")
+    render.add_argument("--out", required=True, metavar="DIR", help="folder of .npz files")
+    render.add_argument("--repeats", type=int, default=3, metavar="N", help="of each scene")
+    render.set_defaults(run=_render)
 
     synthetic = commands.add_parser("synthetic", parents=[shared], help="scenes with a known F")
     synthetic.add_argument("--scenes", nargs="+", choices=KINDS, default=list(KINDS))
@@ -143,6 +149,12 @@ def _real(args: argparse.Namespace) -> int:
         for cut in args.cut
     }
     return _compare(args, sections)
+
+
+def _render(args: argparse.Namespace) -> int:
+    paths = write_pairs(args.out, args.repeats)
+    print(f"{len(paths)} pairs in {args.out}; now: python -m benchmarks real --data {args.out}")
+    return 0
 
 
 def _synthetic(args: argparse.Namespace) -> int:

@@ -5,7 +5,7 @@ Needs pyvista (the extra ``bench``), which renders without a display.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,13 +65,18 @@ def render_pair(name: str) -> tuple[Pair, Image, Image]:
         If pyvista is not installed.
     """
     view1, view2 = render(name)
+    return pair_of(name, view1, view2), view1.image, view2.image
+
+
+def pair_of(name: str, view1: View, view2: View) -> Pair:
+    """Match two views, and keep the truth: the pair of `render_pair`."""
     K = intrinsics()
     R = view2.R @ view1.R.T
     t = view2.t - R @ view1.t
     E = np.cross(np.eye(3), t).T @ R
     F = np.linalg.inv(K).T @ E @ np.linalg.inv(K)
     matches = match_images(view1.image, view2.image)
-    pair = Pair(
+    return Pair(
         name=name,
         group="rendered",
         X=matches.X,
@@ -82,7 +87,6 @@ def render_pair(name: str) -> tuple[Pair, Image, Image]:
         cameras=Cameras(K, K, R, t),
         F_gt=F / np.linalg.norm(F),
     )
-    return pair, view1.image, view2.image
 
 
 def seen_by_both(view1: View, view2: View) -> Floats:
@@ -109,6 +113,24 @@ def seen_by_both(view1: View, view2: View) -> Floats:
 
 def render(name: str) -> tuple[View, View]:
     """Render both views of a scene; see `render_pair`."""
+    scene = SCENES[name]
+    rng = np.random.default_rng(list(SCENES).index(name))
+    view1, view2 = photograph(scene.build, [(place, scene.target) for place in scene.places], rng)
+    return view1, view2
+
+
+def photograph(
+    build: Callable[[_Stage], None],
+    cameras: Sequence[tuple[Point, Point]],
+    rng: np.random.Generator,
+) -> list[View]:
+    """Build a scene and take a picture from each place towards its target.
+
+    Raises
+    ------
+    ValueError
+        If pyvista is not installed.
+    """
     try:
         import pyvista
     except ImportError as error:
@@ -116,17 +138,15 @@ def render(name: str) -> tuple[View, View]:
             "the rendered pairs need pyvista: python -m pip install pyvista "
             "(or the extra bench), or run with --quick"
         ) from error
-    scene = SCENES[name]
-    rng = np.random.default_rng(list(SCENES).index(name))
     window = [SIZE[0] * OVERSAMPLING, SIZE[1] * OVERSAMPLING]
     plotter: Any = pyvista.Plotter(off_screen=True, window_size=window, lighting="none")
     plotter.set_background("lightsteelblue")
     plotter.add_light(pyvista.Light(position=(-6, -9, 14), focal_point=(0, 0, 0), intensity=0.8))
     plotter.add_light(pyvista.Light(position=(9, -5, 6), focal_point=(0, 0, 0), intensity=0.35))
-    scene.build(_Stage(plotter, pyvista, rng))
-    view1, view2 = (_look(plotter, place, scene.target, rng) for place in scene.places)
+    build(_Stage(plotter, pyvista, rng))
+    views = [_look(plotter, place, target, rng) for place, target in cameras]
     plotter.close()
-    return view1, view2
+    return views
 
 
 def _look(plotter: Any, place: Point, target: Point, rng: np.random.Generator) -> View:
@@ -246,6 +266,31 @@ def bricks(rng: np.random.Generator, size: int) -> Image:
             image[y + 3 : y + height, max(x + 3, 0) : max(x + width, 0)] = tone
     image += 0.25 * (rough(rng, size).astype(np.float64) - 128)
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def windows(rng: np.random.Generator, size: int) -> Image:
+    """Make a front of equal windows in rows and columns, with hardly any dirt."""
+    wall = np.array([120, 140, 170], dtype=np.float64)
+    step = size // 10
+    tile = np.full((step, step, 3), wall)
+    frame, glass = (200, 200, 210), (60, 50, 40)
+    tile[step // 5 - 6 : 4 * step // 5 + 8, step // 4 - 6 : 3 * step // 4 + 6] = frame
+    tile[step // 5 : 4 * step // 5, step // 4 : 3 * step // 4] = glass
+    tile[step // 5 : 4 * step // 5, step // 2 - 2 : step // 2 + 2] = frame
+    tile[step // 2 - 2 : step // 2 + 2, step // 4 : 3 * step // 4] = frame
+    image = np.full((size, size, 3), wall)
+    image[: 10 * step, : 10 * step] = np.tile(tile, (10, 10, 1))
+    image += 0.12 * (rough(rng, size).astype(np.float64) - 128)
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def facade(stage: _Stage) -> None:
+    """Build a front of equal windows, with two boxes and a ball before it."""
+    stage.ground(24, rough(stage.rng, 1536), 3)
+    stage.wall(6, 20, 12, windows(stage.rng, 2048))
+    stage.box(-5, 4.5, (2.5, 2, 5))
+    stage.box(4, 5.6, (2, 0.8, 3))
+    stage.ball(0, 2, 0.6)
 
 
 def _table(stage: _Stage) -> None:
