@@ -11,7 +11,7 @@ Floats = NDArray[np.floating]
 Bools = NDArray[np.bool_]
 
 #: A plane is dominant with at least this share of the inliers, and so many: six are always on one.
-_DOMINANT = 0.5
+_DOMINANT = 0.7
 _FEWEST = 12
 #: Steps to the plane of most inliers, each with little weight for what is off the last one's.
 _STEPS = 3
