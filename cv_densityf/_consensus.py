@@ -147,7 +147,7 @@ def search(
     seed : int
         Where the draws' random numbers start.
     watch : Stopwatch
-        Is charged with the time of draws, polish and vote.
+        Is charged with the time of the draws, and of what is made of them as polish.
     about : (array, float), optional
         What `middle` says of X, if it is known.
     scores : array, shape (n,), optional
@@ -168,15 +168,18 @@ def search(
     frame = Frame(X, (np.zeros(4), spread))
     rng = np.random.default_rng(abs(seed))
     n_draws = 0
-    for reliability in rankings:
-        order = np.argsort(-reliability, kind="stable")[: np.count_nonzero(reliability >= 0.0)]
+    pool: _Pool | None = None
+    for ranking in rankings:
+        order = np.argsort(-ranking, kind="stable")[: np.count_nonzero(ranking >= 0.0)]
         reliable = order[: max(MIN_DRAW, len(order) // 2)]
-        pool = _Pool(X, np.nan_to_num(reliability, nan=0.5), reliable, threshold, rng, frame)
-        made, agreed = _fill(pool, X, order, scores, confidence, max_iters, seed + n_draws, watch)
+        latest = _Pool(X, np.nan_to_num(ranking, nan=0.5), reliable, threshold, rng, frame)
+        made, agreed = _fill(latest, X, order, scores, confidence, max_iters, seed + n_draws, watch)
         n_draws += made
+        if len(latest):
+            pool, reliability = latest, ranking
         if agreed:
             break
-    if len(pool) == 0:
+    if pool is None:
         return None
     pool.complete()
     if not pool.agrees(_CLOSE_AGREEMENT):

@@ -1,4 +1,4 @@
-"""The one place that calls cv2's estimator, and the names of its methods."""
+"""cv2's own function, the names and settings of its methods, and how it fails."""
 
 from __future__ import annotations
 

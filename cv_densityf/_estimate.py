@@ -238,7 +238,7 @@ def _search_threshold(spread: float, robust: Robust, density: str) -> float:
 def _rankings(
     X: NDArray[np.float64], trust: NDArray[np.float64] | None, seed: int, watch: Stopwatch
 ) -> Iterator[NDArray[np.float64]]:
-    """Reliability of a part, well spread and from the better half by score; then of all."""
+    """Reliability of a part of the better half by score, spread if it is large; then of all."""
     n = len(X)
     if n > MAX_RANKED:
         better = np.arange(n) if trust is None else best_scored(trust, max(n // 2, MAX_RANKED))

@@ -1,4 +1,4 @@
-"""Any point array that cv2 takes, as rows x, y, x', y'. Nothing else knows about shapes.
+"""Any point array that cv2 takes, as rows x, y, x', y'.
 
 Only arrays whose meaning to cv2 is certain are read; the rest answer None, and the caller leaves
 them to cv2.

@@ -663,6 +663,25 @@ def test_the_next_ranking_is_asked_for_where_no_two_draws_agree(monkeypatch):
     assert sampson_distance(alone.F, true_matches(0)).mean() > 1.0
 
 
+def test_a_ranking_without_any_draw_leaves_what_the_one_before_found(monkeypatch):
+    X = scene_of(0, inlier_ratio=0.3).X
+    first, second = contrast_support(X)[0], np.linspace(0.0, 1.0, len(X))
+    monkeypatch.setattr(_Pool, "agrees", lambda *_: False)
+    options = {"watch": Stopwatch(), **ASKED}
+    alone = search(X, [first], seed=0, **options)
+
+    def draw(points, threshold, confidence, max_iters, seed, best_first=False):
+        if seed < alone.n_draws:
+            return _engine.draw(points, threshold, confidence, max_iters, seed, best_first)
+        return None
+
+    monkeypatch.setattr(_consensus, "draw", draw)
+    found = search(X, [first, second], seed=0, **options)
+    assert found.n_draws > alone.n_draws
+    np.testing.assert_array_equal(found.F, alone.F)
+    assert found.reliability is first
+
+
 def test_the_reason_tells_of_agreement(monkeypatch):
     X = scene_of(0, inlier_ratio=0.9, noise=0.2).X
     found = find(X)
