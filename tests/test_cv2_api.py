@@ -787,3 +787,13 @@ def test_a_mask_that_cv2_ignores_changes_nothing(given):
     np.testing.assert_array_equal(F, expected_F)
     np.testing.assert_array_equal(mask, expected)
     np.testing.assert_array_equal(given, before)
+
+
+def test_the_seed_of_params_counts():
+    scene = two_view_scene(300, inlier_ratio=0.3, noise=1.0, random_state=0)
+    found = [
+        findFundamentalMat(scene.points1, scene.points2, params(randomGeneratorState=seed))[0]
+        for seed in (1, 2, 3, 1)
+    ]
+    np.testing.assert_array_equal(found[0], found[3])
+    assert any(not np.array_equal(found[0], other) for other in found[1:3])

@@ -230,3 +230,26 @@ def test_a_draw_from_degenerate_matches_is_none_or_finite(points):
 
 def test_a_draw_from_matches_that_are_not_numbers_is_none():
     assert draw(np.full((40, 4), np.nan, np.float32), 1.0, 0.99, 100, 0) is None
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_draw_that_is_told_the_order_starts_with_the_best(seed):
+    """Thirty right matches ahead of 570 wrong ones are found at once, and not by chance."""
+    right = two_view_scene(30, inlier_ratio=1.0, noise=0.2, random_state=seed).X
+    wrong = np.random.default_rng(seed).uniform(0, [1280, 960] * 2, (570, 4))
+    points = np.vstack([right, wrong]).astype(np.float32)
+
+    def fit(best_first):
+        F = draw(points, 1.0, 0.999, 300, seed, best_first)
+        return np.inf if F is None else np.median(sampson_distance(F, right))
+
+    assert fit(best_first=True) < 1
+    assert fit(best_first=False) > 5
+
+
+def test_params_say_whether_the_best_rows_come_first():
+    params = cv2.UsacParams()
+    for sampler in (cv2.SAMPLING_UNIFORM, cv2.SAMPLING_PROSAC):
+        params.sampler = sampler
+        robust = Robust(cv2.FM_RANSAC, 1.0, 0.99, 100, params)
+        assert robust.best_first == (sampler == cv2.SAMPLING_PROSAC)

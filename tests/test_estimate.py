@@ -16,9 +16,11 @@ from scipy.stats import spearmanr
 from cv_densityf import (
     Estimate,
     FundamentalMatrixEstimator,
+    _estimate,
     estimate_fundamental,
     findFundamentalMat,
 )
+from cv_densityf._consensus import search
 from cv_densityf._engine import METHODS, Robust, original
 from cv_densityf._epipolar import eight_point, inlier_mask, middle, sampson_distance
 from cv_densityf._estimate import _CELLS, MIN_FILTERED, _spread, run
@@ -785,3 +787,24 @@ def test_empty_lists_are_no_matches():
     assert not found
     assert found.mask.shape == (0,)
     assert "0 finite matches" in found.reason
+
+
+def test_the_search_gets_confidence_and_iterations(monkeypatch):
+    asked = []
+
+    def recorded(*args, **kwargs):
+        asked.append(kwargs)
+        return search(*args, **kwargs)
+
+    monkeypatch.setattr(_estimate, "search", recorded)
+    scene = scene_of()
+    for confidence, max_iters, seed in ((0.9, 70, 0), (0.99, 700, 5)):
+        estimate_fundamental(
+            scene.points1,
+            scene.points2,
+            confidence=confidence,
+            max_iters=max_iters,
+            random_state=seed,
+        )
+        got = asked[-1]
+        assert (got["confidence"], got["max_iters"], got["seed"]) == (confidence, max_iters, seed)
