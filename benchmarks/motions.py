@@ -93,7 +93,7 @@ def _write(path: Path, pair: Pair) -> None:
     assert pair.scores is not None
     assert pair.cameras is not None
     order = np.argsort(-pair.scores, kind="stable")
-    truth = pair.truth[:: max(1, len(pair.truth) // _TRUTH)]
+    truth = pair.truth[np.linspace(0, len(pair.truth) - 1, _TRUTH).astype(int)]
     np.savez_compressed(
         path,
         pts1=pair.X[order, :2],

@@ -188,8 +188,8 @@ def search(
     F = pool.refined_best() if others is None else pool.before(others - centre).settled_best()
     F = shift(-centre[2:]).T @ F @ shift(-centre[:2])
     watch.lap("polish")
-    again = ", found again by another" if agreed else ""
-    reason = f"the hypothesis with the most votes of {n_draws} draws{again}"
+    again = ", found again by another" if agreed and pool.agrees_off_plane() else ""
+    reason = f"the hypothesis with {pool.virtue} of {n_draws} draws{again}"
     return Consensus(F, reliability, tuple(pool.votes.tolist()), n_draws, reason)
 
 
@@ -234,7 +234,8 @@ def _fill(
         if agreed and not asked_rest:
             asked_rest = True
             rest = ~pool.near_best(_NEAR_WIDTH)[order]
-            if rest[: len(order) // 2].mean() > _UNEXPLAINED:
+            much = rest[: len(order) // 2].mean() > _UNEXPLAINED
+            if much and np.count_nonzero(rest) >= MIN_DRAW:
                 iters = min(max_iters, MAX_DRAW_ITERS // 2)
                 F = draw(points[rest], pool.working, confidence, iters, seed + n_draws)
                 n_draws += 1
@@ -337,9 +338,12 @@ class _Pool:
         """Where a plane has most inliers of the best hypothesis, add others of that plane."""
         width = _PLANE_WIDTH * self.working
         inliers = self.near_best(1.0)
-        G, off_plane = plane_and_parallax(
-            self._frame, self._G[self.best], inliers, width, self._rng
-        )
+        try:
+            G, off_plane = plane_and_parallax(
+                self._frame, self._G[self.best], inliers, width, self._rng
+            )
+        except np.linalg.LinAlgError:
+            return
         if len(G):
             self._off_plane = off_plane
             self.add(self._frame.leave(G), np.zeros(len(G)))
@@ -366,11 +370,22 @@ class _Pool:
         """Inliers of each hypothesis as ones, in a type that can be multiplied fast, (m, n)."""
         return (self._squared < self.working**2).astype(np.float32)
 
-    def agrees(self, overlap: float = _AGREEMENT) -> bool:
+    @property
+    def virtue(self) -> str:
+        """What the best hypothesis has most of."""
+        if self.best == self.votes.argmax():
+            return "the most votes"
+        return "the most inliers off a dominant plane"
+
+    def agrees_off_plane(self) -> bool:
+        """Whether the draws that agree do so off a dominant plane, if there is one."""
+        return self._off_plane is None or self.agrees(among=self._off_plane)
+
+    def agrees(self, overlap: float = _AGREEMENT, among: Bools | None = None) -> bool:
         """Whether draws from two different parts have the best hypothesis's inliers."""
         if len(self) < 2:
             return False
-        inliers = self._inliers()
+        inliers = self._inliers() if among is None else self._inliers()[:, among]
         alike = _alike(inliers, inliers[self.best], overlap)
         sizes = self._sizes[alike & (self._sizes > 0)]
         return len(sizes) > 1 and bool(sizes.max() >= _DISTINCT * sizes.min())
@@ -383,8 +398,11 @@ class _Pool:
     def before(self, others: Floats) -> _Pool:
         """Put the best hypotheses, of different inliers, to more matches, all equal."""
         inliers = self._inliers()
+        ranking = np.argsort(-self.votes, kind="stable").tolist()
+        # What has lost on a dominant plane is out.
+        ranking = ranking[ranking.index(self.best) :]
         chosen: list[int] = []
-        for i in np.argsort(-self.votes, kind="stable").tolist():
+        for i in ranking:
             if not _alike(inliers[chosen], inliers[i], _AGREEMENT).any():
                 chosen.append(i)
             if len(chosen) == _FINALISTS:
@@ -434,7 +452,7 @@ def _noise(squared: Floats, threshold: float) -> float:
     for _ in range(4):
         below = int(r.searchsorted(cut))
         if below < 8:
-            return sigma
+            break
         sigma = 1.4826 * float(r[below // 2])
         cut = min(_WIDEST * threshold, 2.5 * sigma)
     return sigma * (1.0 + 5.0 / max(below - 7, 5))

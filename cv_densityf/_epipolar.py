@@ -181,13 +181,15 @@ class Frame:
 
     def _sums(self, weights: Floats, rows: Floats) -> Floats:
         """Weighted sums (m, r) of ``rows`` (r, n), for weights (m, n)."""
-        parts = self._parts(len(rows) * len(weights))
-        return np.asarray(sum(weights[:, part] @ rows[:, part].T for part in parts))
+        total = np.zeros((len(weights), len(rows)))
+        for part in self._parts(total.size):
+            total += weights[:, part] @ rows[:, part].T
+        return total
 
     def _parts(self, multiplications: int) -> list[slice]:
         """Cut the matches, of so many multiplications each, to what one thread of BLAS does."""
         n = self.products.shape[1]
-        size = max(1, _ONE_THREAD // multiplications)
+        size = max(1, _ONE_THREAD // max(1, multiplications))
         return [slice(start, start + size) for start in range(0, n, size)]
 
     def sampson(self, G: Floats) -> Floats:

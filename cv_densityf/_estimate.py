@@ -78,7 +78,8 @@ class Estimate:
     votes : tuple of float
         The vote for each polished hypothesis of the last search, in the order of the draws; then
         for those of a dominant plane, and for that of the local optimisation, where there were any.
-        Of many matches, those of the part that searched.
+        Of many matches, those of the part that searched. Where a plane is dominant, the winner's
+        need not be the largest: the number of inliers off the plane decides.
 
     See Also
     --------
@@ -368,8 +369,8 @@ def estimate_fundamental(
     threshold : float
         Largest residual of an inlier, pixels, in (1e-12, 1e6); unused by ``"lmeds"``, which finds
         its own. It rules the mask: the search has one of its own, a hundredth of the points'
-        spread, within a factor of two of this one, at least half of it; ``density="paper"`` takes
-        this one.
+        spread, brought to within a factor of two of this one, but never below half of that
+        hundredth; ``density="paper"`` takes this one.
     confidence : float
         Of each draw to have found the best model, in (0, 1).
     max_iters : int

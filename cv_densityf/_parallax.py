@@ -58,11 +58,11 @@ def plane_and_parallax(
         The matches that are not on it.
     """
     norm = frame.errors(G[None])[1]
-    norm = np.maximum(norm, 0.01 * norm.mean())  # it is 0 for a match of the two epipoles
+    norm = np.maximum(norm, 0.01 * np.median(norm))  # it is 0 for a match of the two epipoles
     plane: Floats = inliers.astype(np.float64)
     for _ in range(_STEPS):
         family = np.linalg.eigh(frame.gram(plane / norm))[1][0, :, :3]
-        coordinates = family.T @ frame.products
+        coordinates = family.T @ frame.products  # of so few matches that BLAS starts no threads
         squared = (coordinates**2).sum(axis=0) / (norm[0] * (frame.scale * width) ** 2)
         plane = inliers / (1.0 + squared) ** 2
     off_plane = squared >= 1.0

@@ -238,10 +238,18 @@ def test_a_denser_motion_does_not_win_over_the_larger_one(seed):
     assert np.median(sampson_distance(find(X, reliability).F, larger)) < 0.1
 
 
-def test_little_that_is_unexplained_is_not_drawn_from(monkeypatch):
+@pytest.mark.parametrize(("wrong", "made"), [(0.15, 2), (0.4, 3)])
+def test_only_much_that_is_unexplained_is_drawn_from(wrong, made, monkeypatch):
     draws = spied_draws(monkeypatch, _engine.draw)
-    X = scene_of(0, inlier_ratio=0.9).X
-    assert find(X).n_draws == len(draws) == 2
+    right = true_matches(0, 400)
+    n = round(400 * wrong / (1 - wrong))
+    X = np.vstack([right, np.random.default_rng(0).uniform(0, [1280, 960] * 2, (n, 4))])
+    order = np.random.default_rng(1).permutation(len(X))
+    reliability = np.empty(len(X))
+    reliability[order] = np.linspace(0.0, 1.0, len(X))  # tells nothing
+    assert find(X, reliability).n_draws == len(draws) == made
+    if made == 3:
+        assert 0.8 * n < len(draws[2][0]) <= n
 
 
 def test_two_different_answers_are_no_agreement(monkeypatch):
@@ -963,3 +971,23 @@ def test_papers_ransac_needs_eight_matches(n):
         )
         is None
     )
+
+
+@pytest.mark.parametrize("n", [12, 16, 30])
+def test_few_residuals_of_a_fit_do_not_tell_too_small_a_noise(n):
+    """Of n residuals seven degrees of freedom are spent; the median makes up for it."""
+    told = []
+    for seed in range(400):
+        rng = np.random.default_rng(seed)
+        A = np.linalg.qr(rng.normal(size=(n, 7)))[0]
+        r = rng.normal(size=n)
+        told.append(_noise((r - A @ (A.T @ r)) ** 2, 3.0))
+    assert 0.75 < np.median(told) < 1.35
+
+
+@pytest.mark.parametrize("seed", [0, 7, 8])
+def test_the_reason_tells_of_a_dominant_plane(seed):
+    found = find(mostly_one_plane(seed, inlier_ratio=0.9, share=0.95)[0])
+    most = max(found.votes)
+    assert "off a dominant plane" in found.reason
+    assert most > 0

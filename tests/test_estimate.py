@@ -808,3 +808,12 @@ def test_the_search_gets_confidence_and_iterations(monkeypatch):
         )
         got = asked[-1]
         assert (got["confidence"], got["max_iters"], got["seed"]) == (confidence, max_iters, seed)
+
+
+@pytest.mark.parametrize(
+    ("threshold", "searched"), [(0.1, 1.5), (1.0, 2.0), (4.0, 3.0), (10.0, 5.0)]
+)
+def test_the_searchs_threshold_is_a_hundredth_of_the_spread_near_the_callers(threshold, searched):
+    robust = Robust(cv2.USAC_DEFAULT, threshold, 0.99, 1000)
+    assert _estimate._search_threshold(300.0, robust, "contrast") == searched
+    assert _estimate._search_threshold(300.0, robust, "paper") == threshold

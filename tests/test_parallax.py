@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from cv_densityf import estimate_fundamental
 from cv_densityf._epipolar import Frame, sampson_distance
 from cv_densityf._parallax import plane_and_parallax
 
@@ -87,6 +88,36 @@ def test_without_a_dominant_plane_there_is_nothing(seed):
     assert len(completed(X, true)[0]) == 0
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+def test_half_of_the_inliers_are_no_dominant_plane(seed):
+    X, true, _ = scene(seed, on=180, off=120)
+    assert len(completed(X, true)[0]) == 0
+
+
+def test_a_few_matches_are_always_on_a_plane():
+    X, true, _ = scene(0, on=8, off=2, wrong=200)
+    assert len(completed(X, true)[0]) == 0
+
+
+@pytest.mark.parametrize("far", [1e9, 1e30])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_match_far_out_is_no_matter(seed, far):
+    X, _, other = scene(seed)
+    expected = completed(X, other)[0]
+    X = np.vstack([X, [[far, 0.7 * far, 300.0, 300.0]]])
+    assert len(expected) == 2
+    assert np.median(sampson_distance(completed(X, other)[0][0], X[300:312])) < 1e-6
+
+
+@pytest.mark.parametrize("seed", [0, 7])
+def test_of_many_matches_too_the_plane_does_not_win(seed):
+    """The best hypothesis of a part stays the best when all others are heard."""
+    X, *_ = scene(seed, on=8100, off=60, wrong=900, noise=0.5)
+    order = np.random.default_rng(seed).permutation(len(X))
+    found = estimate_fundamental(X[order, :2], X[order, 2:])
+    assert np.median(sampson_distance(found.F, X[8100:8160])) < 1.0
+
+
 @pytest.mark.parametrize("off", [0, 1])
 def test_fewer_than_two_matches_off_the_plane_fix_nothing(off):
     X, _, other = scene(0, off=off, wrong=0)
@@ -111,3 +142,13 @@ def test_a_match_of_the_two_epipoles_is_no_matter():
     ends = [np.linalg.svd(F)[2][2] for F in (other, other.T)]
     X = np.vstack([X, np.hstack([e[:2] / e[2] for e in ends])])
     assert np.median(sampson_distance(completed(X, other)[0][0], X[300:312])) < 1e-6
+
+
+@pytest.mark.parametrize("seed", [0, 6, 12])
+def test_draws_of_the_plane_do_not_confirm_what_completes_it(seed):
+    """They share nearly all inliers with it, and have missed what tells."""
+    X, *_ = scene(seed, on=3500, off=35, wrong=400, noise=0.5)
+    order = np.random.default_rng(seed).permutation(len(X))
+    found = estimate_fundamental(X[order, :2], X[order, 2:])
+    assert np.median(sampson_distance(found.F, X[3500:3535])) < 1.5
+    assert "found again" not in found.reason
