@@ -41,8 +41,10 @@ ROUNDS = (
 )
 _NEAR_WIDTH = 8.0
 #: What the draws agree on may be one of several motions: with more than this share of the reliable
-#: half unexplained, one more draw is from all that is unexplained, before they may end.
+#: half unexplained, one more draw is from all that is unexplained, before they may end. A motion
+#: that is the larger one has most of these, so that this draw is short.
 _UNEXPLAINED = 0.25
+_SHORT_DRAW_ITERS = 200
 #: Matches a draw gets at least: fewer crowd on too little of the image to fix F.
 MIN_DRAW = 30
 #: cv2's iterations in one draw from a quarter of the ranked matches, and less from larger, less
@@ -236,7 +238,7 @@ def _fill(
             rest = ~pool.near_best(_NEAR_WIDTH)[order]
             much = rest[: len(order) // 2].mean() > _UNEXPLAINED
             if much and np.count_nonzero(rest) >= MIN_DRAW:
-                iters = min(max_iters, MAX_DRAW_ITERS // 2)
+                iters = min(max_iters, _SHORT_DRAW_ITERS)
                 F = draw(points[rest], pool.working, confidence, iters, seed + n_draws)
                 n_draws += 1
                 watch.lap("draws")
