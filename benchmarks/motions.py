@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from benchmarks.data import Pair
-from benchmarks.rendered import SCENES, facade, pair_of, photograph
+from benchmarks.rendered import SCENES, camera_axes, facade, pair_of, photograph
 
 Floats = NDArray[np.float64]
 
@@ -82,11 +82,9 @@ def _moved(
     wander: float,
     rng: np.random.Generator,
 ) -> tuple[Floats, Floats]:
-    ahead = (target - place) / np.linalg.norm(target - place)
-    right = np.cross(ahead, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, np.cross(right, ahead), ahead])
-    return place + step(rng) @ axes, target + wander * rng.normal(size=3)
+    right, up, ahead = step(rng)
+    moved = place + (right, -up, ahead) @ camera_axes(place, target)
+    return moved, target + wander * rng.normal(size=3)
 
 
 def _write(path: Path, pair: Pair) -> None:

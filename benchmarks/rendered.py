@@ -159,12 +159,17 @@ def _look(plotter: Any, place: Point, target: Point, rng: np.random.Generator) -
     depth = -np.asarray(plotter.get_image_depth(), dtype=np.float64)
     image = cv2.resize(large, SIZE, interpolation=cv2.INTER_AREA).astype(np.float64)
     image += rng.normal(0, SENSOR_NOISE, image.shape)
-    forward = np.subtract(target, place)
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0, 0, 1])
-    right /= np.linalg.norm(right)
-    R = np.stack([right, np.cross(forward, right), forward])
+    R = camera_axes(place, target)
     return View(np.clip(np.rint(image), 0, 255).astype(np.uint8), depth, R, -R @ place)
+
+
+def camera_axes(place: Any, target: Any) -> Floats:
+    """Directions right, down and ahead of an upright camera that looks at a point, (3, 3)."""
+    ahead = np.subtract(target, place)
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(ahead, right), ahead])
 
 
 class _Stage:

@@ -53,7 +53,7 @@ def point_line_squared(F: Floats, X: Floats) -> Floats:
 
 def sampson_distance(F: Floats, X: Floats) -> Floats:
     """Sampson distance of each match, pixels, (n,)."""
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(all="ignore"):
         return np.sqrt(_sampson_squared(F, X))
 
 
@@ -61,7 +61,7 @@ def residuals(F: Floats, X: Floats, rule: Rule) -> Floats:
     """Return the distance in pixels that ``rule`` compares with its threshold, (n,)."""
     if rule == "usac":
         return sampson_distance(F, X)
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(all="ignore"):
         return np.sqrt(point_line_squared(F, X))
 
 

@@ -754,8 +754,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         return _epipolar.inlier_mask(self.F_, matches, self._rule, self.threshold_)
 
     def _residuals(self, matches: NDArray[np.float64]) -> NDArray[np.float64]:
-        with np.errstate(all="ignore"):
-            distance = _epipolar.residuals(self.F_, matches, self._rule)
+        distance = _epipolar.residuals(self.F_, matches, self._rule)
         return np.where(np.isnan(distance), np.inf, distance)
 
 
