@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,13 +64,19 @@ _SIGNIFICANT = 2.0
 _PLANE_WIDTH = 2.0
 #: Draws from parts whose sizes differ by less than this factor are not independent.
 _DISTINCT = 1.4
-#: Samples of the local optimisation and largest size of these, how many working thresholds from
-#: the best hypothesis they are taken, and how far their polish looks.
-_LOCAL_SAMPLES = 16
+#: Largest size of the samples of the local optimisation, how many working thresholds from the
+#: hypothesis they are taken, and how far their polish looks.
 _LOCAL_SIZE = 14
 _LOCAL_WIDTH = 3.0
 _LOCAL_REACH = 20.0
 _LOCAL_STEPS = 2
+#: How many of them there are where draws agree; and where none do, from each of so many hypotheses,
+#: of which another one may be next to the right one. With this intersection over union two of them
+#: lead to the same.
+_LOCAL_SAMPLES = 16
+_LOCAL_SAMPLES_IN_DOUBT = 32
+_LOCAL_STARTS_IN_DOUBT = 2
+_SAME_BASIN = 0.8
 #: Widths of the vote, in units of the working threshold.
 _VOTE_WIDTHS = np.array([0.3, 0.5, 0.8, 1.3])
 #: Votes saturate within a cell of this many to the longer side of each image.
@@ -132,7 +139,7 @@ def search(
     independent one arrives at the best hypothesis's inliers, and one from what these leave, if that
     is much, is no better; or after `ROUNDS` on each ranking. Where most inliers are on a plane,
     other hypotheses of that plane are then tried. Unless two draws are nearly the same, the best
-    hypothesis is optimised locally.
+    hypothesis is optimised locally; where none agree, another one as well.
 
     Parameters
     ----------
@@ -315,9 +322,7 @@ class _Pool:
     def _poll(self, G: Floats) -> tuple[Floats, Floats]:
         """Squared residuals (m, n) of hypotheses and the votes for them (m,)."""
         squared = self._frame.sampson(G)
-        # The root: odd pixels or a cropped image should not decide.
-        credit = np.sqrt(essential_ratio(G))
-        return squared, self._ballot.count(squared, self.working) * credit
+        return squared, self._ballot.count(squared, self.working) * _credit(G)
 
     def adapted(self, F: Floats) -> Floats:
         """Polish F (m, 3, 3), pixels, and narrow the working threshold to the best one's noise."""
@@ -351,22 +356,32 @@ class _Pool:
             self.add(self._frame.leave(G), np.zeros(len(G)))
 
     def optimise(self) -> None:
-        """Fit samples of the best hypothesis's neighbours; the fit with the most votes joins.
+        """Optimise the best hypothesis locally; if draws do not agree on it, another one as well.
 
         The inner sampling of Chum, Matas and Kittler, "Locally optimized RANSAC" (2003), with the
         vote as its score.
         """
-        near = np.flatnonzero(self.near_best(_LOCAL_WIDTH))
-        size = min(_LOCAL_SIZE, len(near) // 2)
+        if self.agrees():
+            self._optimise_from(self.best, _LOCAL_SAMPLES)
+        else:
+            for start in self._finalists(_LOCAL_STARTS_IN_DOUBT, _SAME_BASIN):
+                self._optimise_from(start, _LOCAL_SAMPLES_IN_DOUBT)
+
+    def _optimise_from(self, start: int, n_samples: int) -> None:
+        """Fit samples of a hypothesis's neighbours; the fit with the most votes joins."""
+        rows = self._squared[start] < (_LOCAL_REACH * self.working) ** 2
+        near = self._squared[start, rows] < (_LOCAL_WIDTH * self.working) ** 2
+        size = min(_LOCAL_SIZE, int(np.count_nonzero(near)) // 2)
         if size < 8:
             return
-        keys = self._rng.random((_LOCAL_SAMPLES, len(near)))
-        samples = near[keys.argpartition(size, axis=1)[:, :size]]
-        part = self._frame.part(self.near_best(_LOCAL_REACH))
-        G = polish(part, self._frame.fitted(samples), [_POLISH_WIDTH * self.working] * _LOCAL_STEPS)
-        squared, votes = self._poll(G)
-        best = [votes.argmax()]
-        self._append(G[best], squared[best], votes[best], [0])
+        keys = np.where(near, self._rng.random((n_samples, len(near))), np.inf)
+        samples = keys < np.partition(keys, size, axis=1)[:, size, None]
+        part = self._frame.part(rows)
+        widths = [np.inf, *[_POLISH_WIDTH * self.working] * _LOCAL_STEPS]
+        G = polish(part, self._G[[start]], widths, samples=samples)
+        votes = self._ballot.part(rows).count(part.sampson(G), self.working) * _credit(G)
+        G = G[[votes.argmax()]]
+        self._append(G, *self._poll(G), [0])
 
     def _inliers(self) -> Floats:
         """Inliers of each hypothesis as ones, in a type that can be multiplied fast, (m, n)."""
@@ -397,18 +412,23 @@ class _Pool:
         best = self._G[self.best]
         return _refined(self._frame, best, self._reliable, self.threshold)
 
-    def before(self, others: Floats) -> _Pool:
-        """Put the best hypotheses, of different inliers, to more matches, all equal."""
+    def _finalists(self, most: int, overlap: float) -> list[int]:
+        """Return the indices of the best hypotheses whose inliers overlap by less."""
         inliers = self._inliers()
         ranking = np.argsort(-self.votes, kind="stable").tolist()
         # What has lost on a dominant plane is out.
         ranking = ranking[ranking.index(self.best) :]
         chosen: list[int] = []
         for i in ranking:
-            if not _alike(inliers[chosen], inliers[i], _AGREEMENT).any():
+            if not _alike(inliers[chosen], inliers[i], overlap).any():
                 chosen.append(i)
-            if len(chosen) == _FINALISTS:
+            if len(chosen) == most:
                 break
+        return chosen
+
+    def before(self, others: Floats) -> _Pool:
+        """Put the finalists to more matches, all equal."""
+        chosen = self._finalists(_FINALISTS, _AGREEMENT)
         X = np.concatenate([self._X, others])
         wider = _Pool(X, np.ones(len(X)), self._reliable, self.threshold, self._rng)
         wider.working = self.working
@@ -431,6 +451,12 @@ def _alike(inliers: Floats, one: Floats, overlap: float) -> Bools:
     """Which of some inlier sets (m, n) agree with another one (n,)."""
     common = inliers @ one
     return np.asarray(common >= overlap * (inliers.sum(axis=1) + one.sum() - common))
+
+
+def _credit(G: Floats) -> Floats:
+    """How well each hypothesis suits ordinary cameras: what its votes are multiplied by."""
+    # The root: odd pixels or a cropped image should not decide.
+    return np.sqrt(essential_ratio(G))
 
 
 def _refined(frame: Frame, G: Floats, reliable: Ints, threshold: float) -> NDArray[np.float64]:
@@ -472,6 +498,15 @@ class _Ballot:
     def __init__(self, X: Floats, reliability: Floats) -> None:
         self._reliability = reliability
         self._cells = [_cells(X[:, :2]), _cells(X[:, 2:])]
+        self._groups = [_groups(cell) for cell in self._cells]
+
+    def part(self, rows: Bools) -> _Ballot:
+        """Return the same ballot, holding only the matches marked in ``rows`` (n,)."""
+        part = copy(self)
+        part._reliability = self._reliability[rows]
+        part._cells = [cell[rows] for cell in self._cells]
+        part._groups = [_groups(cell) for cell in part._cells]
+        return part
 
     def count(self, squared: Floats, working: float) -> Floats:
         """Votes for each hypothesis from its squared residuals (m, n), (m,)."""
@@ -481,20 +516,24 @@ class _Ballot:
         np.maximum(votes, 0.0, out=votes)
         votes *= self._reliability
         total = np.zeros(len(squared))
-        for order, starts in self._cells:
+        for order, starts in self._groups:
             total += np.sqrt(np.add.reduceat(votes[..., order], starts, axis=-1)).sum(axis=(0, -1))
         return total
 
 
-def _cells(points: Floats) -> tuple[Ints, Ints]:
-    """Rows sorted by grid cell, and where each occupied cell starts."""
+def _cells(points: Floats) -> Ints:
+    """Give each point the number of its grid cell."""
     columns = np.ascontiguousarray(points.T)
     columns = columns - columns.min(axis=1, keepdims=True)
     side = max(float(columns.max()), 1e-9)
-    place = np.minimum(columns * (_GRID / side), _GRID - 1).astype(np.intp)
-    cell = place[0] * _GRID + place[1]
+    place = np.minimum(columns * (_GRID / side), _GRID - 1).astype(np.uint16)
+    return np.asarray(place[0] * _GRID + place[1])
+
+
+def _groups(cell: Ints) -> tuple[Ints, Ints]:
+    """Rows sorted by grid cell, and where each occupied cell starts."""
     # Of so small integers numpy sorts by their digits.
-    order = np.argsort(cell.astype(np.uint16), kind="stable")
+    order = np.argsort(cell, kind="stable")
     cell = cell[order]
     return order, np.flatnonzero(np.concatenate([[True], cell[1:] != cell[:-1]]))
 

@@ -153,11 +153,6 @@ class Frame:
         """Fundamental matrices (m, 3, 3) of this frame, in pixels."""
         return np.asarray(self._second.T @ G @ self._first)
 
-    def fitted(self, samples: NDArray[np.intp]) -> Floats:
-        """Least squares for each sample of eight or more rows (m, k), not yet of rank 2."""
-        A = self.products.T[samples]
-        return np.linalg.svd(A, full_matrices=True)[2][:, 8].reshape(-1, 3, 3)
-
     def errors(self, G: Floats) -> tuple[Floats, Floats]:
         """Algebraic error and squared gradient norm of each match under each matrix, (m, n)."""
         m = len(G)
@@ -306,7 +301,11 @@ def eight_point(samples: Floats) -> NDArray[np.float64]:
 
 
 def polish(
-    frame: Frame, G: Floats, scales: Sequence[float | Floats], noise: float | None = None
+    frame: Frame,
+    G: Floats,
+    scales: Sequence[float | Floats],
+    noise: float | None = None,
+    samples: NDArray[np.bool_] | None = None,
 ) -> Floats:
     """Refine fundamental matrices on all matches, one weighted Gauss-Newton step per scale.
 
@@ -331,14 +330,16 @@ def polish(
         `essential_ratio` falls short of 1 is one more residual, of standard deviation
         ``_SHORTFALL`` and with Cauchy's weights of width ``_FOREIGN``. It tells where the matches
         do not, and loses its say where the cameras seem to be of another kind.
+    samples : array, shape (k, n), bool, optional
+        The first step is on these matches alone, for each matrix; or k steps from a single one.
 
     Returns
     -------
-    array, shape (m, 3, 3)
+    array, shape (m, 3, 3), or (k, 3, 3)
         Refined matrices of rank 2 and unit norm, in the frame.
     """
-    m = len(G)
     for scale in scales:
+        m = len(G)
         G, U, S, Vt = _rank_two(G)
         # The directions u_i v_j^T in which the rank stays two, and the one that keeps the norm.
         outer = (U.transpose(0, 2, 1)[:, :, None, :, None] * Vt[:, None, :, None]).reshape(m, 9, 9)
@@ -350,13 +351,15 @@ def polish(
         squared = algebraic * algebraic / norm
         weight = 1.0 / (1.0 + squared / width**2)
         weight *= weight / norm
+        if samples is not None:
+            weight, samples = weight * samples, None
         half = tangent @ frame.gram(weight)
         hessian = half @ tangent.transpose(0, 2, 1)
         gradient = half @ G.reshape(m, 9, 1)
         # The denominator's part, half the derivative of x^T G^T D G x + x'^T G D G^T x'.
         moments = frame.moments(weight * squared)
         drift = _NORMAL @ G @ moments[:, 0] + moments[:, 1] @ G @ _NORMAL
-        gradient -= tangent @ drift.reshape(m, 9, 1)
+        gradient -= tangent @ drift.reshape(-1, 9, 1)
         if noise is not None:
             nudge = _NUDGE * tangent.reshape(m, 7, 3, 3)
             nudged = G[:, None] + np.concatenate([0.0 * nudge[:, :1], nudge, -nudge], 1)
@@ -370,7 +373,7 @@ def polish(
         damping = 1e-9 * np.einsum("mkk->m", hessian) + _TINY
         step = -np.linalg.solve(hessian + damping[:, None, None] * _EYE, gradient)
         step *= np.minimum(1.0, 0.5 / (np.sqrt((step * step).sum(axis=1, keepdims=True)) + _TINY))
-        G = G + (step.transpose(0, 2, 1) @ tangent).reshape(m, 3, 3)
+        G = G + (step.transpose(0, 2, 1) @ tangent).reshape(-1, 3, 3)
     return _rank_two(G)[0]
 
 

@@ -227,6 +227,19 @@ def test_local_optimisation_finds_more_votes_near_a_poor_hypothesis(seed):
     assert not pool.agrees()
 
 
+@pytest.mark.parametrize("seed", [0, 2, 7])
+def test_in_doubt_another_hypothesis_than_the_best_is_optimised_as_well(seed):
+    """A poor one of the larger motion, fixed by eight matches, gets ahead of the smaller motion."""
+    larger = scene_of(seed, n=250, inlier_ratio=1.0, noise=0.3).X
+    X = np.vstack([larger, true_matches(seed + 50, n=150)])
+    X -= X.mean(axis=0)
+    pool = _Pool(X, np.ones(400), np.arange(400), 1.0, np.random.default_rng(seed))
+    pool.add(np.concatenate([eight_point(X[None, 250:]), eight_point(X[None, :8])]), [150, 8])
+    assert pool.best == 0
+    pool.optimise()
+    assert pool.near_best(2.0)[:250].all()
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_a_denser_motion_does_not_win_over_the_larger_one(seed):
     """Draws on the densest agree on it; what it leaves has a say before they end."""
@@ -729,7 +742,7 @@ def test_cells_are_those_of_a_square_grid():
     rng = np.random.default_rng(0)
     for size, offset in (((900, 300), (5, -2000)), ((0.1, 0.7), (3, 3))):
         points = rng.uniform(0, size, (500, 2)) + offset
-        order, starts = _consensus._cells(points)
+        order, starts = _consensus._groups(_consensus._cells(points))
         assert sorted(order) == list(range(500))
         low = points.min(axis=0)
         place = np.floor((points - low) * 16 / (points.max(axis=0) - low).max()).clip(max=15)
@@ -800,6 +813,17 @@ def test_votes_fall_with_the_residual_to_nothing():
     assert votes[-1] == 0.0
     wider = _Ballot(X, np.ones(26)).count(np.full((1, 26), 0.25), 2.0)
     assert wider > votes[3]
+
+
+def test_a_part_of_a_ballot_has_the_votes_of_its_matches():
+    X = scene_of(0, n=100).X
+    rng = np.random.default_rng(0)
+    reliability, squared = rng.uniform(size=100), rng.uniform(0, 2, (3, 100))
+    ballot, rows = _Ballot(X, reliability), X[:, 0] < 400
+    squared[:, ~rows] = np.inf
+    np.testing.assert_allclose(
+        ballot.part(rows).count(squared[:, rows], 1.0), ballot.count(squared, 1.0)
+    )
 
 
 def test_vote_does_not_change_with_the_place_order_and_unit_of_the_matches():
