@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from copy import copy
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -202,6 +203,15 @@ def search(
     return Consensus(F, reliability, tuple(pool.votes.tolist()), n_draws, reason)
 
 
+class _Part(NamedTuple):
+    """What a draw is from, with its most iterations, and the size that tells it from others."""
+
+    points: Floats
+    iters: int
+    size: int
+    best_first: bool = False
+
+
 def _fill(
     pool: _Pool,
     X: Floats,
@@ -214,9 +224,9 @@ def _fill(
 ) -> tuple[int, bool]:
     """Make rounds of draws until two of them agree; how many it took, and whether they do."""
     points = X[order].astype(np.float32)
-    n_draws, asked_rest = 0, False
+    n_draws, agreed, asked_rest = 0, False, False
     for fractions in ROUNDS:
-        found, sizes = [], []
+        parts = []
         for fraction in fractions:
             by_score = fraction == BY_SCORE
             if by_score and scores is not None:
@@ -229,33 +239,44 @@ def _fill(
                 continue
             share = min(max(len(part) / len(order), 0.25), 1.0)
             iters = min(max_iters, int(MAX_DRAW_ITERS * np.sqrt(0.25 / share)))
-            F = draw(part, pool.working, confidence, iters, seed + n_draws, best_first=by_score)
-            n_draws += 1
-            if F is not None:
-                found.append(F)
-                sizes.append(len(part))
-        watch.lap("draws")
-        if found:
-            F = np.stack(found)
-            pool.add(F if len(pool) else pool.adapted(F), sizes)
-        watch.lap("polish")
+            parts.append(_Part(part, iters, len(part), by_score))
+        _draw(pool, parts, confidence, seed + n_draws, watch)
+        n_draws += len(parts)
         agreed = pool.agrees()
         if agreed and not asked_rest:
             asked_rest = True
             rest = ~pool.near_best(_NEAR_WIDTH)[order]
             much = rest[: len(order) // 2].mean() > _UNEXPLAINED
             if much and np.count_nonzero(rest) >= MIN_DRAW:
-                iters = min(max_iters, _SHORT_DRAW_ITERS)
-                F = draw(points[rest], pool.working, confidence, iters, seed + n_draws)
+                short = _Part(points[rest], min(max_iters, _SHORT_DRAW_ITERS), 0)
+                _draw(pool, [short], confidence, seed + n_draws, watch)
                 n_draws += 1
-                watch.lap("draws")
-                if F is not None:
-                    pool.add(F[None], [0])
-                    agreed = pool.agrees()
-                watch.lap("polish")
+                agreed = pool.agrees()
         if agreed:
             break
     return n_draws, agreed
+
+
+def _draw(pool: _Pool, parts: list[_Part], confidence: float, seed: int, watch: Stopwatch) -> None:
+    """Draw a hypothesis from each part; those that are found join the pool."""
+    found, sizes = [], []
+    for number, part in enumerate(parts):
+        F = draw(
+            part.points,
+            pool.working,
+            confidence,
+            part.iters,
+            seed + number,
+            best_first=part.best_first,
+        )
+        if F is not None:
+            found.append(F)
+            sizes.append(part.size)
+    watch.lap("draws")
+    if found:
+        F = np.stack(found)
+        pool.add(F if len(pool) else pool.adapted(F), sizes)
+    watch.lap("polish")
 
 
 class _Pool:
