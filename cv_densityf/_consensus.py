@@ -66,15 +66,15 @@ _PLANE_WIDTH = 2.0
 #: Draws from parts whose sizes differ by less than this factor are not independent.
 _DISTINCT = 1.4
 #: Largest size of the samples of the local optimisation, how many working thresholds from the
-#: hypothesis they are taken, and how far their polish looks.
+#: hypothesis they are taken, and how far their polish and their vote look.
 _LOCAL_SIZE = 14
 _LOCAL_WIDTH = 3.0
 _LOCAL_REACH = 20.0
 _LOCAL_STEPS = 2
-#: How many of them there are where draws agree; and where none do, from each of so many hypotheses,
-#: of which another one may be next to the right one. With this intersection over union two of them
-#: lead to the same.
+#: Number of samples where draws agree.
 _LOCAL_SAMPLES = 16
+#: Where none do, the right F may be next to another hypothesis than the best: number of samples
+#: from each of so many, whose inliers have less than this intersection over union.
 _LOCAL_SAMPLES_IN_DOUBT = 32
 _LOCAL_STARTS_IN_DOUBT = 2
 _SAME_BASIN = 0.8
@@ -389,7 +389,10 @@ class _Pool:
                 self._optimise_from(start, _LOCAL_SAMPLES_IN_DOUBT)
 
     def _optimise_from(self, start: int, n_samples: int) -> None:
-        """Fit samples of a hypothesis's neighbours; the fit with the most votes joins."""
+        """Step from a hypothesis on samples of its near matches, and polish; the best one joins.
+
+        The matches it is not far from polish, and choose by their votes.
+        """
         rows = self._squared[start] < (_LOCAL_REACH * self.working) ** 2
         near = self._squared[start, rows] < (_LOCAL_WIDTH * self.working) ** 2
         size = min(_LOCAL_SIZE, int(np.count_nonzero(near)) // 2)
@@ -542,18 +545,18 @@ class _Ballot:
         return total
 
 
-def _cells(points: Floats) -> Ints:
+def _cells(points: Floats) -> NDArray[np.uint16]:
     """Give each point the number of its grid cell."""
     columns = np.ascontiguousarray(points.T)
     columns = columns - columns.min(axis=1, keepdims=True)
     side = max(float(columns.max()), 1e-9)
+    # Of so small integers numpy sorts by their digits.
     place = np.minimum(columns * (_GRID / side), _GRID - 1).astype(np.uint16)
     return np.asarray(place[0] * _GRID + place[1])
 
 
-def _groups(cell: Ints) -> tuple[Ints, Ints]:
+def _groups(cell: NDArray[np.uint16]) -> tuple[Ints, Ints]:
     """Rows sorted by grid cell, and where each occupied cell starts."""
-    # Of so small integers numpy sorts by their digits.
     order = np.argsort(cell, kind="stable")
     cell = cell[order]
     return order, np.flatnonzero(np.concatenate([[True], cell[1:] != cell[:-1]]))

@@ -331,7 +331,8 @@ def polish(
         ``_SHORTFALL`` and with Cauchy's weights of width ``_FOREIGN``. It tells where the matches
         do not, and loses its say where the cameras seem to be of another kind.
     samples : array, shape (k, n), bool, optional
-        The first step is on these matches alone, for each matrix; or k steps from a single one.
+        The matches that the first step is restricted to, for each matrix: k is m, or m is 1 and k
+        matrices come of the same one. An infinite scale gives them all the same weight.
 
     Returns
     -------

@@ -169,7 +169,9 @@ def test_pairs_are_read_a_little_ahead_only(pairs):
 
 
 # As of joblib 1.6, loky's own thread may trip over pairs that are just being taken back.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+@pytest.mark.filterwarnings(
+    "ignore:Exception in thread ExecutorManagerThread:pytest.PytestUnhandledThreadExceptionWarning"
+)
 @pytest.mark.parametrize("n_jobs", [1, 2])
 def test_leaving_early_is_no_reason_to_warn(pairs, n_jobs):
     estimates = estimate_many(pairs * 5, n_jobs=n_jobs)

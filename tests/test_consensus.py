@@ -227,6 +227,20 @@ def test_local_optimisation_finds_more_votes_near_a_poor_hypothesis(seed):
     assert not pool.agrees()
 
 
+@pytest.mark.parametrize(("sizes", "samples"), [((60, 150), [16]), ((60, 60), [32, 32])])
+def test_a_rival_is_optimised_only_where_no_draws_agree(monkeypatch, sizes, samples):
+    X = np.vstack([true_matches(0, n=250), true_matches(50, n=150)])
+    X -= X.mean(axis=0)
+    larger, smaller = eight_point(X[None, :250]), eight_point(X[None, 250:])
+    pool = _Pool(X, np.ones(400), np.arange(400), 1.0, np.random.default_rng(0))
+    pool.add(np.concatenate([larger, larger, smaller]), [*sizes, 100])
+    starts = []
+    monkeypatch.setattr(_Pool, "_optimise_from", lambda pool, *start: starts.append(start))
+    pool.optimise()
+    assert [n_samples for _, n_samples in starts] == samples
+    assert [start for start, _ in starts] == [pool.best, 2][: len(samples)]
+
+
 @pytest.mark.parametrize("seed", [0, 2, 7])
 def test_in_doubt_another_hypothesis_than_the_best_is_optimised_as_well(seed):
     """A poor one of the larger motion, fixed by eight matches, gets ahead of the smaller motion."""
