@@ -274,8 +274,7 @@ def _draw(pool: _Pool, parts: list[_Part], confidence: float, seed: int, watch: 
             sizes.append(part.size)
     watch.lap("draws")
     if found:
-        F = np.stack(found)
-        pool.add(F if len(pool) else pool.adapted(F), sizes)
+        (pool.add if len(pool) else pool.begin)(np.stack(found), sizes)
     watch.lap("polish")
 
 
@@ -311,19 +310,35 @@ class _Pool:
         self._ballot = _Ballot(X.clip(-reach, reach), reliability)
         self._G: Floats = np.empty((0, 3, 3))
         self._squared: Floats = np.empty((0, len(X)))
+        #: Inliers of each hypothesis as ones, in a type that can be multiplied fast, (m, n).
+        self._inliers: Floats = np.empty((0, len(X)), dtype=np.float32)
         self._sizes: Floats = np.empty(0)
 
     def __len__(self) -> int:
         return len(self._G)
 
+    def begin(self, F: Floats, sizes: ArrayLike) -> None:
+        """Add the first hypotheses, and narrow the working threshold to the best one's noise."""
+        G = self._polished(self._frame.enter(F))
+        squared = self._frame.sampson(G)
+        best = self._ballot.count(squared, self.working).argmax()
+        scale = _SIGMAS * _noise(squared[best, self._reliable], self.threshold)
+        self.working = max(min(scale, self.threshold), _SMALLEST_SCALE * self.threshold)
+        self._join(G, sizes)
+
     def add(self, F: Floats, sizes: ArrayLike) -> None:
         """Polish hypotheses (m, 3, 3), in pixels, drawn from ``sizes`` matches, and count votes."""
-        G = self._polished(F)
+        self._join(self._frame.enter(F), sizes)
+
+    def _join(self, G: Floats, sizes: ArrayLike) -> None:
+        G = self._polished(G)
         self._append(G, *self._poll(G), sizes)
 
     def _append(self, G: Floats, squared: Floats, votes: Floats, sizes: ArrayLike) -> None:
         self._G = np.concatenate([self._G, G])
         self._squared = np.concatenate([self._squared, squared])
+        inliers = (squared < self.working**2).astype(np.float32)
+        self._inliers = np.concatenate([self._inliers, inliers])
         self.votes = np.concatenate([self.votes, votes])
         self._sizes = np.concatenate([self._sizes, sizes])
         self.best = int(self.votes.argmax()) if self._off_plane is None else self._richest()
@@ -331,9 +346,8 @@ class _Pool:
     def _richest(self) -> int:
         """Index of the most votes, or of as many inliers on the plane and more off it."""
         elected = int(self.votes.argmax())
-        inliers = self._inliers()
-        common = inliers @ inliers[elected]
-        off_plane = inliers[:, self._off_plane]
+        common = self._inliers @ self._inliers[elected]
+        off_plane = self._inliers[:, self._off_plane]
         gain = off_plane - off_plane[elected]
         lead = gain.sum(axis=1) - _SIGNIFICANT * np.sqrt(np.abs(gain).sum(axis=1))
         lead[common < _CONTAINED * common[elected]] = -np.inf
@@ -345,18 +359,9 @@ class _Pool:
         squared = self._frame.sampson(G)
         return squared, self._ballot.count(squared, self.working) * _credit(G)
 
-    def adapted(self, F: Floats) -> Floats:
-        """Polish F (m, 3, 3), pixels, and narrow the working threshold to the best one's noise."""
-        G = self._polished(F)
-        squared = self._frame.sampson(G)
-        best = self._ballot.count(squared, self.working).argmax()
-        scale = _SIGMAS * _noise(squared[best, self._reliable], self.threshold)
-        self.working = max(min(scale, self.threshold), _SMALLEST_SCALE * self.threshold)
-        return self._frame.leave(G)
-
-    def _polished(self, F: Floats) -> Floats:
+    def _polished(self, G: Floats) -> Floats:
         widths = [_POLISH_WIDTH * self.working] * _POLISH_STEPS
-        return polish(self._frame, self._frame.enter(F), widths)
+        return polish(self._frame, G, widths)
 
     def near_best(self, width: float) -> Bools:
         """Mark the matches within ``width`` working thresholds of the best hypothesis."""
@@ -374,7 +379,7 @@ class _Pool:
             return
         if len(G):
             self._off_plane = off_plane
-            self.add(self._frame.leave(G), np.zeros(len(G)))
+            self._join(G, np.zeros(len(G)))
 
     def optimise(self) -> None:
         """Optimise the best hypothesis locally; if draws do not agree on it, another one as well.
@@ -407,10 +412,6 @@ class _Pool:
         G = G[[votes.argmax()]]
         self._append(G, *self._poll(G), [0])
 
-    def _inliers(self) -> Floats:
-        """Inliers of each hypothesis as ones, in a type that can be multiplied fast, (m, n)."""
-        return (self._squared < self.working**2).astype(np.float32)
-
     @property
     def virtue(self) -> str:
         """What the best hypothesis has most of."""
@@ -426,7 +427,7 @@ class _Pool:
         """Whether draws from two different parts have the best hypothesis's inliers."""
         if len(self) < 2:
             return False
-        inliers = self._inliers() if among is None else self._inliers()[:, among]
+        inliers = self._inliers if among is None else self._inliers[:, among]
         alike = _alike(inliers, inliers[self.best], overlap)
         sizes = self._sizes[alike & (self._sizes > 0)]
         return len(sizes) > 1 and bool(sizes.max() >= _DISTINCT * sizes.min())
@@ -438,13 +439,12 @@ class _Pool:
 
     def _finalists(self, most: int, overlap: float) -> list[int]:
         """Return the indices of the best hypotheses whose inliers overlap by less."""
-        inliers = self._inliers()
         ranking = np.argsort(-self.votes, kind="stable").tolist()
         # What has lost on a dominant plane is out.
         ranking = ranking[ranking.index(self.best) :]
         chosen: list[int] = []
         for i in ranking:
-            if not _alike(inliers[chosen], inliers[i], overlap).any():
+            if not _alike(self._inliers[chosen], self._inliers[i], overlap).any():
                 chosen.append(i)
             if len(chosen) == most:
                 break
@@ -485,10 +485,9 @@ def _credit(G: Floats) -> Floats:
 
 def _refined(frame: Frame, G: Floats, reliable: Ints, threshold: float) -> NDArray[np.float64]:
     G = G[None]
-    for _ in range(_REFINE_STEPS):
-        noise = _noise(frame.sampson(G)[0, reliable], threshold)
-        width = max(_REFINE_SIGMAS * noise, _NARROWEST * threshold)
-        G = polish(frame, G, [width], noise)
+    noise = _noise(frame.sampson(G)[0, reliable], threshold)
+    width = max(_REFINE_SIGMAS * noise, _NARROWEST * threshold)
+    G = polish(frame, G, [width] * _REFINE_STEPS, noise)
     return np.ascontiguousarray(frame.leave(G)[0])
 
 
@@ -521,28 +520,26 @@ class _Ballot:
 
     def __init__(self, X: Floats, reliability: Floats) -> None:
         self._reliability = reliability
-        self._cells = [_cells(X[:, :2]), _cells(X[:, 2:])]
-        self._groups = [_groups(cell) for cell in self._cells]
+        self._cells = np.stack([_cells(X[:, :2]), _cells(X[:, 2:]) + _GRID * _GRID])
+        self._order, self._starts = _groups(self._cells)
 
     def part(self, rows: Bools) -> _Ballot:
         """Return the same ballot, holding only the matches marked in ``rows`` (n,)."""
         part = copy(self)
         part._reliability = self._reliability[rows]
-        part._cells = [cell[rows] for cell in self._cells]
-        part._groups = [_groups(cell) for cell in part._cells]
+        part._cells = self._cells[:, rows]
+        part._order, part._starts = _groups(part._cells)
         return part
 
     def count(self, squared: Floats, working: float) -> Floats:
         """Votes for each hypothesis from its squared residuals (m, n), (m,)."""
         widths = (_VOTE_WIDTHS * working)[:, None, None]
-        votes = squared[None] / (-widths * widths)
+        votes = squared / (-widths * widths)
         votes += 1.0
         np.maximum(votes, 0.0, out=votes)
         votes *= self._reliability
-        total = np.zeros(len(squared))
-        for order, starts in self._groups:
-            total += np.sqrt(np.add.reduceat(votes[..., order], starts, axis=-1)).sum(axis=(0, -1))
-        return total
+        votes = np.add.reduceat(votes.take(self._order, axis=-1), self._starts, axis=-1)
+        return np.asarray(np.sqrt(votes).sum(axis=(0, -1)))
 
 
 def _cells(points: Floats) -> NDArray[np.uint16]:
@@ -555,11 +552,13 @@ def _cells(points: Floats) -> NDArray[np.uint16]:
     return np.asarray(place[0] * _GRID + place[1])
 
 
-def _groups(cell: NDArray[np.uint16]) -> tuple[Ints, Ints]:
-    """Rows sorted by grid cell, and where each occupied cell starts."""
-    order = np.argsort(cell, kind="stable")
-    cell = cell[order]
-    return order, np.flatnonzero(np.concatenate([[True], cell[1:] != cell[:-1]]))
+def _groups(cells: NDArray[np.uint16]) -> tuple[Ints, Ints]:
+    """Rows sorted by grid cell, one grid (k, n) after another, and where each group starts."""
+    flat = cells.ravel()
+    order = np.argsort(flat, kind="stable")
+    flat = flat[order]
+    starts = np.flatnonzero(np.concatenate([[True], flat[1:] != flat[:-1]]))
+    return order % cells.shape[1], starts
 
 
 def eight_point_ransac(

@@ -177,6 +177,6 @@ def draw(
         F, _ = original(points[:, :2], points[:, 2:], params)
     except cv2.error:
         return None
-    if F is None or not np.isfinite(F).all() or not F.any():
+    if F is None or not 0.0 < np.abs(F).sum() < np.inf:
         return None
     return np.asarray(F, dtype=np.float64)

@@ -176,16 +176,14 @@ class Frame:
 
     def _sums(self, weights: Floats, rows: Floats) -> Floats:
         """Weighted sums (m, r) of ``rows`` (r, n), for weights (m, n)."""
-        total = np.zeros((len(weights), len(rows)))
-        for part in self._parts(total.size):
-            total += weights[:, part] @ rows[:, part].T
-        return total
+        parts = self._parts(len(weights) * len(rows))
+        return np.asarray(sum(weights[:, part] @ rows[:, part].T for part in parts))
 
     def _parts(self, multiplications: int) -> list[slice]:
         """Cut the matches, of so many multiplications each, to what one thread of BLAS does."""
         n = self.products.shape[1]
         size = max(1, _ONE_THREAD // max(1, multiplications))
-        return [slice(start, start + size) for start in range(0, n, size)]
+        return [slice(start, start + size) for start in range(0, max(1, n), size)]
 
     def sampson(self, G: Floats) -> Floats:
         """Squared Sampson distances in squared pixels, (m, n)."""
@@ -218,23 +216,30 @@ FAR = 5.0
 _EYE = np.eye(7)
 #: D, which leaves of a line's three coefficients the two that make its normal.
 _NORMAL = np.diag([1.0, 1.0, 0.0])
-#: Of the products u_i v_j^T, row by row, those of a tangent space: not u_3 v_3^T, and u_1 v_1^T
-#: makes room for what u_1 v_1^T and u_2 v_2^T have left.
-_TANGENT = np.array([0, 1, 2, 3, 5, 6, 7])
 #: How far the essential ratio of a right matrix may well fall short of 1, and from where on this
 #: tells little, for the camera may be of another kind.
 _SHORTFALL = 0.01
 _FOREIGN = 0.03
 #: By which slopes are taken, of a matrix of unit norm.
 _NUDGE = 1e-4
-#: The other two rows of a matrix for each row, as of columns: cofactors are products of these.
-_NEXT, _LAST = np.array([[1], [2], [0]]), np.array([[2], [0], [1]])
+#: Of a matrix's entries, row by row, those whose products make its cofactors: the first ones times
+#: the second less the third times the fourth.
+_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
+_MINORS = np.stack(
+    [
+        np.add.outer(3 * row, column).ravel()
+        for row, column in ((_NEXT, _NEXT), (_LAST, _LAST), (_NEXT, _LAST), (_LAST, _NEXT))
+    ]
+)
 #: Squared focal lengths, in sizes of the image: from wide angle to telephoto.
 _FOCAL_SQUARED = np.geomspace(0.5, 4.0, 16) ** 2
 _ONES = np.ones_like(_FOCAL_SQUARED)
-#: What the focal length multiplies the squares of a matrix's rows by, and of its cofactors' rows.
-_ENTRY_GAIN = np.stack([_FOCAL_SQUARED, _FOCAL_SQUARED, _ONES])
-_COFACTOR_GAIN = np.stack([_FOCAL_SQUARED, _FOCAL_SQUARED, _FOCAL_SQUARED**2])
+#: What the focal length multiplies the squares of a matrix's rows by, and of its cofactors' rows;
+#: and two of them those of the entries, for all pairs, (9, 256).
+_ROW_GAIN = np.stack([_FOCAL_SQUARED, _FOCAL_SQUARED, _ONES])
+_COFACTOR_ROW_GAIN = np.stack([_FOCAL_SQUARED, _FOCAL_SQUARED, _FOCAL_SQUARED**2])
+_GAIN = np.kron(_ROW_GAIN, _ROW_GAIN)
+_COFACTOR_GAIN = np.kron(_COFACTOR_ROW_GAIN, _COFACTOR_ROW_GAIN)
 
 
 def essential_ratio(F: Floats, image_size: float = np.sqrt(12.0)) -> NDArray[np.float64]:
@@ -254,15 +259,15 @@ def essential_ratio(F: Floats, image_size: float = np.sqrt(12.0)) -> NDArray[np.
         Pixels. The default is that of points spread evenly, in a `Frame`.
     """
     zoom = np.array([image_size, image_size, 1.0])
-    F = F * np.outer(zoom, zoom)
-    cofactors = F[:, _NEXT, _NEXT.T] * F[:, _LAST, _LAST.T]
-    cofactors -= F[:, _NEXT, _LAST.T] * F[:, _LAST, _NEXT.T]
-    # Of K'^T F K: the sum of the squared singular values, and twice their product.
-    total = _ENTRY_GAIN.T @ F**2 @ _ENTRY_GAIN
-    twice = 2.0 * np.sqrt(_COFACTOR_GAIN.T @ cofactors**2 @ _COFACTOR_GAIN)
-    difference = np.sqrt(np.maximum(total - twice, 0.0))
-    both = np.sqrt(total + twice)
-    return np.asarray(((both - difference) / (both + difference)).max(axis=(1, 2)))
+    entries = (F * np.outer(zoom, zoom)).reshape(-1, 9)
+    factors = entries.take(_MINORS, axis=1)
+    cofactors = factors[:, 0] * factors[:, 1] - factors[:, 2] * factors[:, 3]
+    # Of K'^T F K: the sum of the squared singular values s and t, and the square of their product.
+    total = entries**2 @ _GAIN
+    squared = cofactors**2 @ _COFACTOR_GAIN
+    # Of 2 s t / (s^2 + t^2), which grows with t / s, the largest.
+    q = np.sqrt(np.minimum(4.0 * (squared / (total * total)).max(axis=1), 1.0))
+    return np.asarray(q / (1.0 + np.sqrt(1.0 - q * q)))
 
 
 def eight_point(samples: Floats) -> NDArray[np.float64]:
@@ -342,10 +347,11 @@ def polish(
     for scale in scales:
         m = len(G)
         G, U, S, Vt = _rank_two(G)
-        # The directions u_i v_j^T in which the rank stays two, and the one that keeps the norm.
+        # The directions u_i v_j^T in which the rank stays two; of u_1 v_1^T and u_2 v_2^T together
+        # the one that keeps the norm.
         outer = (U.transpose(0, 2, 1)[:, :, None, :, None] * Vt[:, None, :, None]).reshape(m, 9, 9)
-        tangent = outer[:, _TANGENT]
-        tangent[:, 0] = S[:, :1] * outer[:, 4] - S[:, 1:2] * outer[:, 0]
+        outer[:, 4] = S[:, :1] * outer[:, 4] - S[:, 1:2] * outer[:, 0]
+        tangent = outer[:, 1:8]
         algebraic, norm = frame.errors(G)
         norm += _TINY
         width = np.asarray(scale, dtype=float).reshape(-1, 1) * frame.scale

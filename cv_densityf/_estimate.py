@@ -292,7 +292,7 @@ def _on_a_line(X: NDArray[np.float64]) -> bool:
     columns = np.ascontiguousarray(X.T)
     largest = np.abs(columns).max(axis=1)
     centred = columns - columns.mean(axis=1, keepdims=True)
-    covariance = np.einsum("in,jn->ij", centred, centred) / len(X)
+    covariance = centred @ centred.T / len(X)
     for image in (slice(0, 2), slice(2, 4)):
         (a, b), (_, d) = covariance[image, image]
         smallest = 0.5 * (a + d - np.hypot(a - d, 2.0 * b))

@@ -58,7 +58,9 @@ def plane_and_parallax(
         The matches that are not on it.
     """
     norm = frame.errors(G[None])[1]
-    norm = np.maximum(norm, 0.01 * np.median(norm))  # it is 0 for a match of the two epipoles
+    half = norm.shape[1] // 2
+    # It is 0 for a match of the two epipoles.
+    norm = np.maximum(norm, 0.01 * np.partition(norm, half)[:, half])
     plane: Floats = inliers.astype(np.float64)
     for _ in range(_STEPS):
         family = np.linalg.eigh(frame.gram(plane / norm))[1][0, :, :3]

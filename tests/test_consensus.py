@@ -756,7 +756,7 @@ def test_cells_are_those_of_a_square_grid():
     rng = np.random.default_rng(0)
     for size, offset in (((900, 300), (5, -2000)), ((0.1, 0.7), (3, 3))):
         points = rng.uniform(0, size, (500, 2)) + offset
-        order, starts = _consensus._groups(_consensus._cells(points))
+        order, starts = _consensus._groups(_consensus._cells(points)[None])
         assert sorted(order) == list(range(500))
         low = points.min(axis=0)
         place = np.floor((points - low) * 16 / (points.max(axis=0) - low).max()).clip(max=15)
