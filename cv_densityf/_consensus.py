@@ -319,7 +319,8 @@ class _Pool:
 
     def begin(self, F: Floats, sizes: ArrayLike) -> None:
         """Add the first hypotheses, and narrow the working threshold to the best one's noise."""
-        G = self._polished(self._frame.enter(F))
+        # One step tells the noise; those at the right width follow.
+        G = polish(self._frame, self._frame.enter(F), [_POLISH_WIDTH * self.working])
         squared = self._frame.sampson(G)
         best = self._ballot.count(squared, self.working).argmax()
         scale = _SIGMAS * _noise(squared[best, self._reliable], self.threshold)
@@ -331,7 +332,7 @@ class _Pool:
         self._join(self._frame.enter(F), sizes)
 
     def _join(self, G: Floats, sizes: ArrayLike) -> None:
-        G = self._polished(G)
+        G = polish(self._frame, G, [_POLISH_WIDTH * self.working] * _POLISH_STEPS)
         self._append(G, *self._poll(G), sizes)
 
     def _append(self, G: Floats, squared: Floats, votes: Floats, sizes: ArrayLike) -> None:
@@ -358,10 +359,6 @@ class _Pool:
         """Squared residuals (m, n) of hypotheses and the votes for them (m,)."""
         squared = self._frame.sampson(G)
         return squared, self._ballot.count(squared, self.working) * _credit(G)
-
-    def _polished(self, G: Floats) -> Floats:
-        widths = [_POLISH_WIDTH * self.working] * _POLISH_STEPS
-        return polish(self._frame, G, widths)
 
     def near_best(self, width: float) -> Bools:
         """Mark the matches within ``width`` working thresholds of the best hypothesis."""
