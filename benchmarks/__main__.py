@@ -22,6 +22,9 @@ from benchmarks.run import Record, measure, one_thread, warm_up
 from benchmarks.scale import scale
 from benchmarks.scenes import KINDS, make_scene, scenes
 
+#: A section of the report, the seed, and the pairs.
+Run = tuple[str, int, list[Pair]]
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; 2 for arguments that make no sense."""
@@ -50,7 +53,6 @@ def _parser() -> argparse.ArgumentParser:
     shared.add_argument("--threshold", nargs="+", type=float, default=[1.0], metavar="PX")
     shared.add_argument("--confidence", type=float, default=0.999)
     shared.add_argument("--max-iters", type=int, default=5000)
-    shared.add_argument("--seed", type=int, default=0, help="of the shuffle and of the methods")
     shared.add_argument(
         "--time-repeats", type=int, default=1, metavar="N", help="call N times, the fastest counts"
     )
@@ -68,6 +70,14 @@ def _parser() -> argparse.ArgumentParser:
         help="keep SIFT ratios below this; 'all' keeps everything (default)",
     )
     real.add_argument("--sets", nargs="+", metavar="SET", help="only these sets")
+    real.add_argument(
+        "--seed",
+        nargs="+",
+        type=int,
+        default=[0],
+        metavar="N",
+        help="of the shuffle and of the methods; every pair runs with each of them",
+    )
     real.set_defaults(run=_real)
 
     render = commands.add_parser("render", help="write rendered pairs, as data for real")
@@ -83,6 +93,7 @@ def _parser() -> argparse.ArgumentParser:
     synthetic.add_argument(
         "--repeats", type=int, default=10, metavar="N", help="scenes per cell (default 10)"
     )
+    synthetic.add_argument("--seed", type=int, default=0, help="of the scenes and of the methods")
     synthetic.set_defaults(run=_synthetic)
 
     stages = commands.add_parser("stages", help="time of each stage of ours")
@@ -142,13 +153,16 @@ def _cut(text: str) -> float | str:
 
 
 def _real(args: argparse.Namespace) -> int:
-    sections = {
-        "all matches" if cut == "all" else f"SIFT ratio < {cut:g}": load_pairs(
-            args.data, cut, args.seed, args.sets
+    runs = [
+        (
+            "all matches" if cut == "all" else f"SIFT ratio < {cut:g}",
+            seed,
+            load_pairs(args.data, cut, seed, args.sets),
         )
         for cut in args.cut
-    }
-    return _compare(args, sections)
+        for seed in args.seed
+    ]
+    return _compare(args, runs)
 
 
 def _render(args: argparse.Namespace) -> int:
@@ -168,14 +182,14 @@ def _synthetic(args: argparse.Namespace) -> int:
         noises=args.noise,
     ):
         sections[kind].append(pair)
-    return _compare(args, sections)
+    return _compare(args, [(kind, args.seed, pairs) for kind, pairs in sections.items()])
 
 
-def _compare(args: argparse.Namespace, sections: dict[str, list[Pair]]) -> int:
+def _compare(args: argparse.Namespace, runs: Sequence[Run]) -> int:
     methods, skipped = choose(args.methods)
     if skipped:
         print(f"not installed, left out: {', '.join(skipped)}", file=sys.stderr)
-    records = _run(args, sections, methods)
+    records = _run(args, runs, methods)
     print(report.markdown(records, skipped))
     if args.json:
         settings = {k: v for k, v in vars(args).items() if k not in ("run", "json", "plots")}
@@ -186,18 +200,16 @@ def _compare(args: argparse.Namespace, sections: dict[str, list[Pair]]) -> int:
     return 0
 
 
-def _run(
-    args: argparse.Namespace, sections: dict[str, list[Pair]], methods: Sequence[Method]
-) -> list[Record]:
-    n = sum(map(len, sections.values())) * len(args.threshold)
+def _run(args: argparse.Namespace, runs: Sequence[Run], methods: Sequence[Method]) -> list[Record]:
     records = []
+    n = sum(len(pairs) for _, _, pairs in runs) * len(args.threshold)
     with tqdm(total=n, unit="pair") as progress:
         for threshold in args.threshold:
-            settings = Settings(threshold, args.confidence, args.max_iters, args.seed)
-            warm_up(methods, settings)
-            with one_thread():
-                for section, pairs in sections.items():
-                    progress.set_description(f"{section}, {threshold:g} px")
+            for section, seed, pairs in runs:
+                settings = Settings(threshold, args.confidence, args.max_iters, seed)
+                warm_up(methods, settings)
+                progress.set_description(f"{section}, {threshold:g} px")
+                with one_thread():
                     for pair in pairs:
                         records += measure(section, pair, methods, settings, args.time_repeats)
                         progress.update()

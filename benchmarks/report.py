@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import platform
 import re
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
@@ -175,12 +176,19 @@ def _overall(rows: Rows) -> str:
         "total ms": lambda s: f"{s['ms_total']:.0f}",
         f"time / {REFERENCE}": lambda s: _share(s["ms_total"] / reference),
     }
-    n = len(_values(rows, "pair"))
+    n, seeds = len(_values(rows, "pair")), _values(rows, "seed")
     table = _table(
         ["method", *columns],
         ([method, *(show(s) for show in columns.values())] for method, s in summaries.items()),
     )
-    return f"{n} pairs.\n\n{table}"
+    times = f", {len(seeds)} times each, with seeds {_listed(seeds)}" if len(seeds) > 1 else ""
+    return f"{n} pairs{times}.\n\n{table}"
+
+
+def _listed(seeds: Sequence[int]) -> str:
+    if list(seeds) == list(range(seeds[0], seeds[-1] + 1)):
+        return f"{seeds[0]} to {seeds[-1]}"
+    return ", ".join(map(str, seeds))
 
 
 def _per_group(rows: Rows) -> str:
@@ -244,23 +252,30 @@ def _paired(rows: Rows) -> list[str]:
 
 
 def _worst(rows: Rows, count: int = 10) -> list[str]:
-    """List the pairs on which ours is worst, and who does best there."""
+    """List the pairs on which ours is worst, and who does best there, in the median over seeds."""
     by_method = _by_method(rows)
     preferred = (f"{OURS}USAC_ACCURATE", *(m for m in by_method if m.startswith(OURS)))
     ours = next((m for m in preferred if m in by_method), None)
     if ours is None:
         return []
-    best = {
-        pair: min((r for r in rows if r.pair == pair), key=lambda r: r.error)
-        for pair in _values(rows, "pair")
-    }
-    worst = sorted(by_method[ours], key=lambda r: r.error, reverse=True)[:count]
-    body = [
-        [r.pair, str(r.n), _pixels(r.error), _pixels(best[r.pair].error), best[r.pair].method]
-        for r in worst
-    ]
+    errors = {method: _by_pair(own) for method, own in by_method.items()}
+    n = {r.pair: r.n for r in rows}
+    worst = sorted(errors[ours], key=lambda pair: errors[ours][pair], reverse=True)[:count]
+    body = []
+    for pair in worst:
+        best = min(errors, key=lambda method: errors[method][pair])
+        shown = (_pixels(errors[method][pair]) for method in (ours, best))
+        body.append([pair, str(n[pair]), *shown, best])
     header = ["pair", "matches", "error px", "best px", "by"]
     return [f"Worst pairs of {ours}:\n\n" + _table(header, body)]
+
+
+def _by_pair(rows: Rows) -> dict[str, float]:
+    """Error of one method on each pair, the median over the seeds."""
+    errors: dict[str, list[float]] = defaultdict(list)
+    for r in rows:
+        errors[r.pair].append(r.error)
+    return {pair: float(np.median(values)) for pair, values in errors.items()}
 
 
 def _spread(rows: Rows) -> str:

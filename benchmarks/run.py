@@ -26,6 +26,8 @@ class Record:
     section : str
         The table it belongs to, such as a cut of the real pairs or a kind of scene.
     group, pair, method : str
+    seed : int
+        Of the order of the rows and of the method, or of the method alone.
     n : int
         Number of matches.
     threshold : float
@@ -42,6 +44,7 @@ class Record:
     group: str
     pair: str
     method: str
+    seed: int
     n: int
     threshold: float
     error: float
@@ -62,6 +65,7 @@ def measure(
                 group=pair.group,
                 pair=pair.name,
                 method=method.name,
+                seed=settings.seed,
                 n=len(pair.X),
                 threshold=settings.threshold,
                 error=pair.error(F),

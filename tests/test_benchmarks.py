@@ -23,7 +23,8 @@ def exact():
 
 
 def record(method, pair, error, **more):
-    fields = {"section": "s", "group": "g", "n": 9, "threshold": 1.0, "pose_error": np.nan, "ms": 2}
+    fields = {"section": "s", "group": "g", "seed": 0, "n": 9, "threshold": 1.0, "ms": 2}
+    fields["pose_error"] = np.nan
     return Record(method=method, pair=pair, error=error, **(fields | more))
 
 
@@ -307,6 +308,22 @@ class TestReport:
         assert "| b | 9 | lost | 6.00 | cv2:USAC_ACCURATE |" in text
         assert "| ours:USAC_ACCURATE | 0.400 | 1.000 | 0.600 |" in text
 
+    def test_several_seeds_are_one_sample_and_a_pair_is_as_bad_as_its_median(self):
+        errors = {"a": [9.0, 0.1, 0.1], "b": [3.0, 3.0, 0.1]}
+        rows = [
+            record(method, pair, factor * error, seed=seed)
+            for method, factor in (("ours:USAC_ACCURATE", 1.0), ("poselib", 0.5))
+            for pair, of_pair in errors.items()
+            for seed, error in zip((0, 1, 2), of_pair, strict=True)
+        ]
+        text = report.markdown(rows)
+        assert "2 pairs, 3 times each, with seeds 0 to 2.\n" in text
+        assert f"| ours:USAC_ACCURATE | {(3 + 0.2 * 2) / 6:.3f} | {1 / 6:.3f} |" in text
+        assert "| poselib | 0 : 6 |" in text
+        assert "by |\n| --- | --: | --: | --: | --- |\n| b | 9 | 3.00 | 1.50 | poselib |" in text
+        skipping = [r for r in rows if r.seed != 1]
+        assert "2 pairs, 2 times each, with seeds 0, 2.\n" in report.markdown(skipping)
+
     def test_words_stand_left_and_figures_right(self):
         body = [["a", "1.5 [1 to 2]", "motorcycle", ""], ["b", "lost [2 to lost]", "7-point", "3"]]
         table = report._table(["method", "error", "pair", "n"], body)
@@ -352,9 +369,13 @@ class TestReport:
             F_gt=exact.F_gt,
         )
         arguments = ["real", "--data", str(tmp_path), "--cut", "all", ".9", "--methods"]
-        assert main([*arguments, "cv2:USAC_MAGSAC"]) == 0
+        out = tmp_path / "out.json"
+        seeds = ["--seed", "3", "5", "--json", str(out)]
+        assert main([*arguments, "cv2:USAC_MAGSAC", "ours:USAC_FAST", *seeds]) == 0
         printed = capsys.readouterr().out
-        assert "## all matches, threshold 1 px" in printed
+        assert "## all matches, threshold 1 px\n\n1 pairs, 2 times each, with seeds 3, 5" in printed
+        by_seed = {r["seed"]: r["error"] for r in json.loads(out.read_text())["records"]}
+        assert by_seed[3] != by_seed[5]
         assert "## SIFT ratio < 0.9, threshold 1 px" in printed
         assert main([*arguments, "cv2:USAC_MAXSAC"]) == 2
         assert "no method 'cv2:USAC_MAXSAC'" in capsys.readouterr().err
