@@ -159,8 +159,8 @@ def _real(args: argparse.Namespace) -> int:
             seed,
             load_pairs(args.data, cut, seed, args.sets),
         )
-        for cut in args.cut
-        for seed in args.seed
+        for cut in dict.fromkeys(args.cut)
+        for seed in dict.fromkeys(args.seed)
     ]
     return _compare(args, runs)
 
@@ -203,16 +203,15 @@ def _compare(args: argparse.Namespace, runs: Sequence[Run]) -> int:
 def _run(args: argparse.Namespace, runs: Sequence[Run], methods: Sequence[Method]) -> list[Record]:
     records = []
     n = sum(len(pairs) for _, _, pairs in runs) * len(args.threshold)
-    with tqdm(total=n, unit="pair") as progress:
+    with tqdm(total=n, unit="pair") as progress, one_thread():
+        warm_up(methods, Settings())
         for threshold in args.threshold:
             for section, seed, pairs in runs:
                 settings = Settings(threshold, args.confidence, args.max_iters, seed)
-                warm_up(methods, settings)
                 progress.set_description(f"{section}, {threshold:g} px")
-                with one_thread():
-                    for pair in pairs:
-                        records += measure(section, pair, methods, settings, args.time_repeats)
-                        progress.update()
+                for pair in pairs:
+                    records += measure(section, pair, methods, settings, args.time_repeats)
+                    progress.update()
     return records
 
 

@@ -237,7 +237,7 @@ def _wins_and_losses(ours: Rows, theirs: Rows) -> tuple[int, int]:
 
 
 def _paired(rows: Rows) -> list[str]:
-    """Pairs won and lost by each of ours against each peer."""
+    """Count the calls that each of ours wins and loses against each peer."""
     by_method = _by_method(rows)
     ours = [m for m in HEADLINES if m in by_method]
     ours = ours or [m for m in by_method if m.startswith(OURS)]
@@ -248,7 +248,7 @@ def _paired(rows: Rows) -> list[str]:
     for peer in peers:
         counts = (_wins_and_losses(by_method[m], by_method[peer]) for m in ours)
         body.append([peer, *(f"{wins} : {losses}" for wins, losses in counts)])
-    return ["Pairs won : lost (errors within 2 % tie):\n\n" + _table(["against", *ours], body)]
+    return ["Calls won : lost (errors within 2 % tie):\n\n" + _table(["against", *ours], body)]
 
 
 def _worst(rows: Rows, count: int = 10) -> list[str]:

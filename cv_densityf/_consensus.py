@@ -274,7 +274,8 @@ def _draw(pool: _Pool, parts: list[_Part], confidence: float, seed: int, watch: 
             sizes.append(part.size)
     watch.lap("draws")
     if found:
-        (pool.add if len(pool) else pool.begin)(np.stack(found), sizes)
+        join = pool.add if len(pool) else pool.begin
+        join(np.stack(found), sizes)
     watch.lap("polish")
 
 
@@ -550,7 +551,7 @@ def _cells(points: Floats) -> NDArray[np.uint16]:
 
 
 def _groups(cells: NDArray[np.uint16]) -> tuple[Ints, Ints]:
-    """Rows sorted by grid cell, one grid (k, n) after another, and where each group starts."""
+    """Rows sorted by cell, and where each starts; of k grids (k, n) without a number in common."""
     flat = cells.ravel()
     order = np.argsort(flat, kind="stable")
     flat = flat[order]

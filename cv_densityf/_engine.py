@@ -160,7 +160,7 @@ def draw(
     Returns
     -------
     array, shape (3, 3), or None
-        None where cv2 raises or finds no finite matrix.
+        None where cv2 raises, or finds no finite matrix other than zero.
     """
     params = cv2.UsacParams()
     params.threshold = threshold
@@ -177,6 +177,6 @@ def draw(
         F, _ = original(points[:, :2], points[:, 2:], params)
     except cv2.error:
         return None
-    if F is None or not 0.0 < np.abs(F).sum() < np.inf:
+    if F is None or not np.isfinite(F).all() or not F.any():
         return None
     return np.asarray(F, dtype=np.float64)

@@ -176,14 +176,16 @@ class Frame:
 
     def _sums(self, weights: Floats, rows: Floats) -> Floats:
         """Weighted sums (m, r) of ``rows`` (r, n), for weights (m, n)."""
-        parts = self._parts(len(weights) * len(rows))
-        return np.asarray(sum(weights[:, part] @ rows[:, part].T for part in parts))
+        total = np.zeros((len(weights), len(rows)))
+        for part in self._parts(total.size):
+            total += weights[:, part] @ rows[:, part].T
+        return total
 
     def _parts(self, multiplications: int) -> list[slice]:
         """Cut the matches, of so many multiplications each, to what one thread of BLAS does."""
         n = self.products.shape[1]
         size = max(1, _ONE_THREAD // max(1, multiplications))
-        return [slice(start, start + size) for start in range(0, max(1, n), size)]
+        return [slice(start, start + size) for start in range(0, n, size)]
 
     def sampson(self, G: Floats) -> Floats:
         """Squared Sampson distances in squared pixels, (m, n)."""
@@ -234,11 +236,11 @@ _MINORS = np.stack(
 #: Squared focal lengths, in sizes of the image: from wide angle to telephoto.
 _FOCAL_SQUARED = np.geomspace(0.5, 4.0, 16) ** 2
 _ONES = np.ones_like(_FOCAL_SQUARED)
-#: What the focal length multiplies the squares of a matrix's rows by, and of its cofactors' rows;
-#: and two of them those of the entries, for all pairs, (9, 256).
+#: What a focal length multiplies the squares of a matrix's rows by, and of its cofactors' rows;
+#: and what a pair of them does those of the entries, row by row, for all pairs, (9, 256).
 _ROW_GAIN = np.stack([_FOCAL_SQUARED, _FOCAL_SQUARED, _ONES])
 _COFACTOR_ROW_GAIN = np.stack([_FOCAL_SQUARED, _FOCAL_SQUARED, _FOCAL_SQUARED**2])
-_GAIN = np.kron(_ROW_GAIN, _ROW_GAIN)
+_ENTRY_GAIN = np.kron(_ROW_GAIN, _ROW_GAIN)
 _COFACTOR_GAIN = np.kron(_COFACTOR_ROW_GAIN, _COFACTOR_ROW_GAIN)
 
 
@@ -262,12 +264,12 @@ def essential_ratio(F: Floats, image_size: float = np.sqrt(12.0)) -> NDArray[np.
     entries = (F * np.outer(zoom, zoom)).reshape(-1, 9)
     factors = entries.take(_MINORS, axis=1)
     cofactors = factors[:, 0] * factors[:, 1] - factors[:, 2] * factors[:, 3]
-    # Of K'^T F K: the sum of the squared singular values s and t, and the square of their product.
-    total = entries**2 @ _GAIN
+    # Of K'^T F K: the sum of the squares of the singular values s >= t, and that of the product.
+    total = entries**2 @ _ENTRY_GAIN
     squared = cofactors**2 @ _COFACTOR_GAIN
-    # Of 2 s t / (s^2 + t^2), which grows with t / s, the largest.
-    q = np.sqrt(np.minimum(4.0 * (squared / (total * total)).max(axis=1), 1.0))
-    return np.asarray(q / (1.0 + np.sqrt(1.0 - q * q)))
+    # The largest square of 2 s t / (s^2 + t^2), which grows with t / s and tells it.
+    largest = np.minimum(4.0 * (squared / (total * total)).max(axis=1), 1.0)
+    return np.asarray(np.sqrt(largest) / (1.0 + np.sqrt(1.0 - largest)))
 
 
 def eight_point(samples: Floats) -> NDArray[np.float64]:
@@ -347,8 +349,8 @@ def polish(
     for scale in scales:
         m = len(G)
         G, U, S, Vt = _rank_two(G)
-        # The directions u_i v_j^T in which the rank stays two; of u_1 v_1^T and u_2 v_2^T together
-        # the one that keeps the norm.
+        # The directions u_i v_j^T in which the rank stays two, so not the last, u_3 v_3^T; in place
+        # of u_1 v_1^T and u_2 v_2^T, rows 0 and 4, the one of both that keeps the norm.
         outer = (U.transpose(0, 2, 1)[:, :, None, :, None] * Vt[:, None, :, None]).reshape(m, 9, 9)
         outer[:, 4] = S[:, :1] * outer[:, 4] - S[:, 1:2] * outer[:, 0]
         tangent = outer[:, 1:8]

@@ -59,7 +59,7 @@ def plane_and_parallax(
     """
     norm = frame.errors(G[None])[1]
     half = norm.shape[1] // 2
-    # It is 0 for a match of the two epipoles.
+    # The norm is 0 for a match of the two epipoles.
     norm = np.maximum(norm, 0.01 * np.partition(norm, half)[:, half])
     plane: Floats = inliers.astype(np.float64)
     for _ in range(_STEPS):

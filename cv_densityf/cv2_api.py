@@ -34,7 +34,7 @@ _ROBUST = frozenset((cv2.FM_LMEDS, cv2.FM_RANSAC, *range(cv2.USAC_DEFAULT, cv2.U
 
 #: On more points graph cut runs out of memory or kills the process in OpenCV 5.0, as if it squared
 #: their number in 32 bits.
-_GRAPH_CUT_MAX = 46_340
+_GRAPH_CUT_DIES_ABOVE = 46_340
 
 #: Below this threshold cv2's MAGSAC raises whatever the points are.
 _MAGSAC_MIN_THRESHOLD = 1e-3
@@ -277,7 +277,7 @@ def find(
     slot = _mask_slot(call, n, usac)
     ordinary = n >= MIN_FILTERED and _is_ordinary(call)
     if density == "off" or not ordinary or slot is None:
-        if _OPENCV_5 and n > _GRAPH_CUT_MAX and cuts_graph(call.method, call.params):
+        if _OPENCV_5 and n > _GRAPH_CUT_DIES_ABOVE and cuts_graph(call.method, call.params):
             method, params = without_graph_cut(call.method, call.params)
             third = (method, *call[3:6]) if params is None else (params,)
             args, kwargs = (*call[:2], *third, call.mask), {}

@@ -374,8 +374,12 @@ class TestReport:
         assert main([*arguments, "cv2:USAC_MAGSAC", "ours:USAC_FAST", *seeds]) == 0
         printed = capsys.readouterr().out
         assert "## all matches, threshold 1 px\n\n1 pairs, 2 times each, with seeds 3, 5" in printed
-        by_seed = {r["seed"]: r["error"] for r in json.loads(out.read_text())["records"]}
-        assert by_seed[3] != by_seed[5]
+        records = json.loads(out.read_text())["records"]
+        ours = [r for r in records if r["method"] == "ours:USAC_FAST"]
+        (all_3, all_5), (below_3, below_5) = ours[:2], ours[2:]
+        assert [r["seed"] for r in ours] == [3, 5, 3, 5]
+        assert all_3["error"] != all_5["error"]
+        assert below_3["error"] != below_5["error"]
         assert "## SIFT ratio < 0.9, threshold 1 px" in printed
         assert main([*arguments, "cv2:USAC_MAXSAC"]) == 2
         assert "no method 'cv2:USAC_MAXSAC'" in capsys.readouterr().err

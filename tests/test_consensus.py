@@ -631,7 +631,9 @@ def test_finalists_are_the_best_three_of_different_inliers(seed, monkeypatch):
         if len(expected) < 3 and (share[i, expected] < 0.93).all():
             expected.append(i)
     monkeypatch.setattr(_consensus, "polish", lambda frame, G, scales, noise=None: G)
+    pool.working = 1.0
     wider = pool.before(scene_of(1).X)
+    assert wider.working == 1.0
     finalists = wider._frame.leave(wider._G)
     unit = finalists / np.linalg.norm(finalists, axis=(1, 2), keepdims=True)
     wanted = F[expected] / np.linalg.norm(F[expected], axis=(1, 2), keepdims=True)
@@ -767,8 +769,11 @@ def test_cells_are_those_of_a_square_grid():
             assert len(np.unique(place[group], axis=0)) == 1
 
 
-def test_matches_at_one_spot_have_a_vote():
-    assert _Ballot(np.ones((30, 4)), np.ones(30)).count(np.zeros((1, 30)), 1.0) > 0
+def test_each_width_and_image_has_the_root_of_a_cells_votes():
+    ballot = _Ballot(np.ones((30, 4)), np.ones(30))
+    widths, images = len(_consensus._VOTE_WIDTHS), 2
+    votes = ballot.count(np.zeros((1, 30)), 1.0)
+    np.testing.assert_allclose(votes, widths * images * np.sqrt(30))
 
 
 def test_votes_end_at_the_largest_width():

@@ -228,6 +228,13 @@ def test_a_draw_from_degenerate_matches_is_none_or_finite(points):
     assert F is None or np.isfinite(F).all()
 
 
+@pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
+def test_a_draw_of_no_matrix_is_none(value, scene, monkeypatch):
+    X = np.hstack([scene.points1, scene.points2]).astype(np.float32)
+    monkeypatch.setattr(_engine, "original", lambda *_: (np.full((3, 3), value), None))
+    assert draw(X, 1.0, 0.99, 100, 0) is None
+
+
 def test_a_draw_from_matches_that_are_not_numbers_is_none():
     assert draw(np.full((40, 4), np.nan, np.float32), 1.0, 0.99, 100, 0) is None
 
