@@ -481,7 +481,7 @@ def draw(path: str, calls: Mapping[str, Series], clustering: Mapping[str, Series
     """Draw time over the number of matches, both logarithmic."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10, 5), layout="constrained")
+    figure = Figure(figsize=(10, 6), layout="constrained")
     panels = [
         (title, series)
         for title, series in (("estimating F", calls), ("clustering", clustering))
@@ -509,5 +509,6 @@ def draw(path: str, calls: Mapping[str, Series], clustering: Mapping[str, Series
         ax.set_ylabel("time, ms")
         ax.grid(color="0.9", which="both")
         ax.set_axisbelow(True)
-        ax.legend(fontsize=8.5, frameon=False)
+        # Below: curves rise through every corner.
+        ax.legend(fontsize=8.5, frameon=False, loc="upper left", bbox_to_anchor=(0.0, -0.12))
     figure.savefig(path, dpi=100)
