@@ -8,6 +8,7 @@ import os
 import platform
 import sys
 import tempfile
+import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -64,7 +65,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     int
         Exit code: 0 found, 1 no fundamental matrix found, 2 wrong use.
     """
-    options = _parser().parse_args(arguments)
+    options, unknown = _parser().parse_known_args(arguments)
+    if unknown:
+        # By the command's own parser, whose help has the options.
+        options.error(f"unknown: {' '.join(unknown)}")
     if options.run == run_script:
         # Outside of the handlers: what the program raises is not ours to explain.
         return run_script(options)
@@ -111,7 +115,10 @@ def _parser() -> argparse.ArgumentParser:
     add_run(commands)
     _add_verify(commands)
     version = commands.add_parser("version", help="print versions, for a bug report")
-    version.set_defaults(run=_run_version)
+    version.set_defaults(run=_run_version, error=version.error)
+    parser.add_argument(
+        "--version", action="version", version=f"cv-densityf {cv_densityf.__version__}"
+    )
     return parser
 
 
@@ -155,6 +162,7 @@ def _output(*suffixes: str) -> Callable[[str], Path]:
 def _add_method(parser: argparse._ActionsContainer, threshold: float, remark: str = "") -> None:
     parser.add_argument(
         "--method",
+        type=lambda name: name.lower().removeprefix("fm_"),
         choices=METHODS,
         default="usac_accurate",
         metavar="NAME",
@@ -180,8 +188,8 @@ def _add_match(commands: argparse._SubParsersAction[Any]) -> None:
     match.add_argument(
         "--points",
         metavar="FILE",
-        help=".npz with points1 and points2 (n, 2) and optionally scores (n,), or .csv with the "
-        "columns x,y,x',y' and optionally score; instead of images",
+        help=".npz with points1 and points2 (or pts1 and pts2), (n, 2), and optionally scores "
+        "(n,), or .csv with the columns x,y,x',y' and optionally score; instead of images",
     )
     estimate = match.add_argument_group("estimate")
     _add_method(estimate, 1.0)
@@ -198,9 +206,7 @@ def _add_match(commands: argparse._SubParsersAction[Any]) -> None:
         help="how the dense matches are chosen (%(default)s; paper is there for comparison: slower "
         "and less accurate)",
     )
-    estimate.add_argument(
-        "--alpha", metavar="A", type=_ALPHA, default=0.011, help="of --density paper (%(default)s)"
-    )
+    estimate.add_argument("--alpha", metavar="A", type=_ALPHA, help="of --density paper (0.011)")
     estimate.add_argument("--seed", metavar="N", type=_SEED, default=0, help="(%(default)s)")
     matching = match.add_argument_group("matching, for images")
     matching.add_argument(
@@ -228,7 +234,10 @@ def _add_match(commands: argparse._SubParsersAction[Any]) -> None:
         help="write F, mask and matches to OUT.npz or OUT.json",
     )
     output.add_argument(
-        "--plot", type=_output(".png"), metavar="OUT.png", help="draw matches and epipolar lines"
+        "--plot",
+        type=_output(".png"),
+        metavar="OUT.png",
+        help="draw matches, epipolar lines and the decision graph",
     )
     match.set_defaults(run=_run_match, error=match.error)
 
@@ -243,7 +252,7 @@ def _add_demo(commands: argparse._SubParsersAction[Any]) -> None:
     demo.add_argument(
         "--out", type=Path, default=Path("cv-densityf-demo"), metavar="DIR", help="(%(default)s)"
     )
-    demo.set_defaults(run=_run_demo)
+    demo.set_defaults(run=_run_demo, error=demo.error)
 
 
 def _add_verify(commands: argparse._SubParsersAction[Any]) -> None:
@@ -269,7 +278,7 @@ def _add_verify(commands: argparse._SubParsersAction[Any]) -> None:
         "--resume", action="store_true", help="leave pairs alone that are verified already"
     )
     verify.add_argument("--dry-run", action="store_true", help="estimate, and write nothing")
-    verify.set_defaults(run=_run_verify)
+    verify.set_defaults(run=_run_verify, error=verify.error)
 
 
 @contextmanager
@@ -316,6 +325,9 @@ def _run_match(options: argparse.Namespace) -> int:
         if options.images or given:
             name = "images" if options.images else f"--{given[0].replace('_', '-')}"
             options.error(f"--points and {name} exclude each other")
+    if options.alpha is not None and options.density != "paper":
+        options.error("--alpha is of --density paper")
+    alpha = 0.011 if options.alpha is None else options.alpha
     if options.plot is not None:
         from cv_densityf import plotting
 
@@ -352,11 +364,14 @@ def _run_match(options: argparse.Namespace) -> int:
             confidence=options.confidence,
             max_iters=options.max_iters,
             density=options.density,
-            alpha=options.alpha,
+            alpha=alpha,
             scores=scores,
             random_state=options.seed,
         )
     }
+    plain_X = X
+    if robust.best_first and scores is not None:
+        plain_X = X[np.argsort(-scores, kind="stable")]
     n_finite = int(finite_in_cv2(X).sum())
     same_call = n_finite == len(X) and (
         options.density == "off"
@@ -365,12 +380,16 @@ def _run_match(options: argparse.Namespace) -> int:
     )
     compared = options.method != "usac_accurate" or len(X) <= GRAPH_CUT_MAX
     if compared and not same_call:
-        calls["plain cv2"] = lambda: robust.plain(X[:, :2], X[:, 2:])
+        calls["plain cv2"] = lambda: robust.plain(plain_X[:, :2], plain_X[:, 2:])
     with _stage("estimating", timings):
         results, processor = _timed(calls)
     timings.update(processor)
     estimate = results["estimating"]
-    plain = (estimate.F, estimate.mask) if compared and same_call else results.get("plain cv2")
+    plain = None
+    if compared and same_call:
+        plain = _plain_report(X, robust, estimate.F, estimate.mask)
+    elif compared:
+        plain = _plain_report(plain_X, robust, *results["plain cv2"])
     if options.plot is not None and estimate.F is not None and len(estimate.F) > 3:
         raise InputError("seven matches fit several matrices, and --plot draws the lines of one")
     report = {
@@ -378,6 +397,7 @@ def _run_match(options: argparse.Namespace) -> int:
         "threshold": options.threshold,
         **_report(X, robust, estimate, plain, timings),
     }
+    written = [str(path) for path in (options.output, options.plot) if path is not None]
     print(json.dumps(report, allow_nan=False) if options.json else _for_people(report))
     if report["F"] is None:
         reason = "cv2's numbers are not finite" if estimate else estimate.reason
@@ -391,8 +411,9 @@ def _run_match(options: argparse.Namespace) -> int:
     if options.plot is not None:
         with _stage("drawing", timings):
             by_paper = options.density == "paper" and estimate.engine == "density"
-            alpha = options.alpha if by_paper else None
-            _draw(options.plot, images, X, estimate, alpha)
+            _draw(options.plot, images, X, estimate, alpha if by_paper else None)
+    if written and not options.json:
+        print(f"\nWritten: {', '.join(written)}")
     # Such as that a JPEG file is damaged, but was of use.
     sys.stderr.writelines(words)
     return FOUND
@@ -420,7 +441,7 @@ def _report(
     X: Floats,
     robust: Robust,
     estimate: Estimate,
-    plain: tuple[Floats | None, Any] | None,
+    plain: dict[str, Any] | None,
     timings: dict[str, float],
 ) -> dict[str, Any]:
     """Everything `match` says, as JSON can hold it."""
@@ -433,7 +454,7 @@ def _report(
         "median_residual": _median_residual(estimate.F, X[estimate.mask], robust),
         "engine": estimate.engine,
         "n_draws": estimate.n_draws,
-        "cv2": None if plain is None else _plain_report(X, robust, *plain),
+        "cv2": plain,
         "timings_ms": {
             **{name: round(value, 3) for name, value in timings.items()},
             "estimating_stages": {
@@ -480,7 +501,7 @@ def _for_people(report: dict[str, Any]) -> str:
     else:
         plain = ["-", "not run", "-", "-"]
         if report["cv2"] is not None:
-            plain = [report["n_matches"], *_result(report["cv2"]), f"{times['plain cv2']:.1f}"]
+            plain = ["-", *_result(report["cv2"]), f"{times['plain cv2']:.1f}"]
         lines.append(f"{'':<22}{'cv-densityf':>12}{'plain cv2':>12}")
         rows = zip(names, ours, plain, strict=True)
         lines += [f"{name:<22}{a:>12}{b:>12}" for name, a, b in rows]
@@ -489,7 +510,9 @@ def _for_people(report: dict[str, Any]) -> str:
         **times["estimating_stages"],
     }
     named = ", ".join(f"{name} {value:.1f}" for name, value in stages.items())
-    lines.append(f"{'elapsed, ms':<22}  {named}")
+    for name, text in (("elapsed, ms", named), ("how", report["reason"])):
+        start, indent = f"{name:<22}  ", " " * 24
+        lines.append(textwrap.fill(text, 79, initial_indent=start, subsequent_indent=indent))
     if report["F"] is not None:
         rows_of_F = ["  " + "".join(f"{value:>18.9e}" for value in row) for row in report["F"]]
         for first in range(0, len(rows_of_F), 3):
@@ -563,10 +586,13 @@ def _draw(
 def _run_demo(options: argparse.Namespace) -> int:
     from cv_densityf import datasets, plotting
 
-    plotting.require_matplotlib()
+    if options.out.exists() and not options.out.is_dir():
+        options.error(f"--out takes a folder, and {options.out} is a file")
     timings: dict[str, float] = {}
+    # Its message names the extra that has all the demo needs.
     with _stage("reading", timings):
         pair = datasets.motorcycle()
+    plotting.require_matplotlib()
     options.out.mkdir(parents=True, exist_ok=True)
     with _stage("matching", timings):
         matches = match_images(pair.image1, pair.image2)
@@ -594,8 +620,7 @@ def _run_demo(options: argparse.Namespace) -> int:
                 start = time.process_time()
                 F, mask = estimate(X[order], matches.scores[order])
                 elapsed = 1e3 * (time.process_time() - start)
-                error = float("inf") if F is None else pair.error(F)
-                results[name].append((error, int(np.sum(mask)), elapsed))
+                results[name].append((pair.error(F), int(np.sum(mask)), elapsed))
     for name, each in results.items():
         errors, inliers, times = np.array(each).T
         print(
@@ -630,7 +655,7 @@ def _run_demo(options: argparse.Namespace) -> int:
             draw(figure.subplots())
             with replacing(options.out / f"{name}.png") as temporary:
                 figure.savefig(temporary)
-    print(f"\nPlots: {', '.join(f'{options.out / name}.png' for name in drawings)}")
+    print("\nPlots:", *(options.out / f"{name}.png" for name in drawings), sep="\n  ")
     return FOUND
 
 

@@ -325,9 +325,10 @@ def _plain(
     watch.lap("draws")
     name = method_name(robust)
     if F is None:
-        reason += (
-            f"; {name} found no F in {n_finite} finite matches: they may be too few or degenerate"
-        )
+        why = "they may be too few or degenerate"
+        if n_finite < _MINIMAL:
+            why = f"at least {_MINIMAL} are needed"
+        reason += f"; {name} found no F in {n_finite} finite matches: {why}"
     return Estimate(
         F=F,
         mask=mask,

@@ -144,7 +144,7 @@ def _refusing(message: str) -> Iterator[None]:
 def _read_csv(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     rows = _csv_rows(path)
     first = next(rows, None)
-    if first is not None and not _is_number(first[1][0]):
+    if first is not None and not all(map(_is_number, first[1][0].split())):
         _check_header(first[1])
         first = next(rows, None)
     if first is None:

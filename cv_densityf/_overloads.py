@@ -19,6 +19,7 @@ WITH_MAX_ITERS = (
 )
 WITH_DEFAULTS = ("points1", "points2", "method", "ransacReprojThreshold", "confidence", "mask")
 WITH_PARAMS = ("points1", "points2", "params", "mask")
+KEYWORDS = frozenset((*WITH_MAX_ITERS, *WITH_PARAMS))
 
 _INT32 = range(-(2**31), 2**31)
 _FLOATS: tuple[type[Any], ...] = (float, int, np.integer, np.float32, np.float16)

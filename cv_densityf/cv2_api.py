@@ -23,7 +23,7 @@ from cv_densityf._estimate import (
     check_scores,
     run,
 )
-from cv_densityf._overloads import Call, resolve
+from cv_densityf._overloads import KEYWORDS, Call, resolve
 from cv_densityf._points import as_array, as_matches, as_umat, n_points
 
 _OPENCV_5 = int(cv2.__version__.split(".")[0]) >= 5
@@ -265,7 +265,12 @@ def find(
     check_density(density, alpha, dc_percent)
     call = resolve(args, kwargs)
     if call is None:
-        return _passed_on(original(*args, **kwargs), None, density, start)
+        try:
+            return _passed_on(original(*args, **kwargs), None, density, start)
+        except cv2.error as error:
+            if kwargs.keys() - KEYWORDS:
+                error.add_note("cv_densityf adds density, alpha, dc_percent and scores to these.")
+            raise
     usac = call.params is not None or is_usac(call.method)
     points1, points2 = as_array(call.points1), as_array(call.points2)
     n = None if points1 is None or points2 is None else _common_length(points1, points2, usac)

@@ -62,19 +62,21 @@ class ImagePair:
     points1: NDArray[np.float64]
     points2: NDArray[np.float64]
 
-    def error(self, F: NDArray[np.float64]) -> float:
+    def error(self, F: NDArray[np.float64] | None) -> float:
         """Mean distance of the true correspondences to the epipolar lines of ``F``.
 
         Parameters
         ----------
-        F : (3, 3) array
+        F : (3, 3) array, or None
             An estimate of the fundamental matrix.
 
         Returns
         -------
         float
-            Pixels, over both images.
+            Pixels, over both images; infinite for None.
         """
+        if F is None:
+            return float("inf")
         one = np.ones((len(self.points1), 1))
         x1, x2 = np.hstack([self.points1, one]), np.hstack([self.points2, one])
         line1, line2 = x2 @ F, x1 @ F.T

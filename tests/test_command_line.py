@@ -148,7 +148,7 @@ def test_people_read_the_same_numbers(run, npz):
     assert (code, err) == (0, "")
     assert text.startswith("400 matches, usac_accurate, threshold 1 px\n")
     for line, ours, plain in (
-        ("kept as dense", report["n_kept"], 400),
+        ("kept as dense", report["n_kept"], "-"),
         ("inliers", report["n_inliers"], report["cv2"]["n_inliers"]),
         (
             "median residual, px",
@@ -158,8 +158,27 @@ def test_people_read_the_same_numbers(run, npz):
     ):
         assert re.search(rf"^{line} +{ours} +{plain}$", text, re.MULTILINE)
     assert re.search(r"^processor time, ms +[\d.]+ +[\d.]+$", text, re.MULTILINE)
+    assert " ".join(text.split("\nhow")[1].split("\n\nF\n")[0].split()) == report["reason"]
+    assert max(map(len, text.splitlines())) < 80
     numbers = [float(word) for word in text.split("\nF\n")[1].split()]
     np.testing.assert_allclose(numbers, np.ravel(report["F"]), rtol=1e-8)
+
+
+def test_prosac_of_plain_cv2_has_the_best_scores_first(run, tmp_path):
+    scores = np.random.default_rng(0).permutation(400) / 400
+    path = tmp_path / "matches.npz"
+    np.savez(path, points1=SCENE.points1, points2=SCENE.points2, scores=scores)
+    _, out, _ = run("match", "--points", path, "--method", "USAC_PROSAC", "--json")
+    best = np.argsort(-scores)
+    numbers = (cv2.USAC_PROSAC, 1.0, 0.999, 5000)
+    F, _ = cv2.findFundamentalMat(SCENE.points1[best], SCENE.points2[best], *numbers)
+    np.testing.assert_array_equal(json.loads(out)["cv2"]["F"], F)
+
+
+def test_what_is_written_is_named(run, npz, tmp_path):
+    path = tmp_path / "o.npz"
+    assert run("match", "--points", npz, "-o", path)[1].endswith(f"\n\nWritten: {path}\n")
+    json.loads(run("match", "--points", npz, "-o", path, "--json")[1])
 
 
 def test_methods_are_timed_warm_and_in_turn(run, npz, monkeypatch):
@@ -418,7 +437,9 @@ class TestSevenMatches:
         (["match", "--points", "{npz}", "-o", "out.txt"], "'out.txt' does not end in .npz or"),
         (["match", "--points", "{npz}", "-o", "{here}/no/out.npz"], "folder of .* does not exist"),
         (["match", "--points", "{npz}", "--plot", "out.jpg"], "'out.jpg' does not end in .png"),
-        (["demo", "--out", "{npz}"], "File exists"),
+        (["demo", "--out", "{npz}"], "--out takes a folder, and .*npz is a file"),
+        (["match", "--points", "{npz}", "--alpha", ".1"], "--alpha is of --density paper"),
+        (["match", "a.png", "b.png", "--thresold", "2"], r"unknown: --thresold 2 \(see .* match -"),
     ],
 )
 def test_wrong_use(run, npz, tmp_path, arguments, message):

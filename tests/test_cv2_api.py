@@ -200,6 +200,15 @@ def test_needs_both_points_once(args, kwargs):
     assert outcome(original, *args, **kwargs) == (-5, "findFundamentalMat")
 
 
+def test_a_misspelled_keyword_is_told_of_ours():
+    with pytest.raises(cv2.error, match="densty") as caught:
+        findFundamentalMat(P1, P2, cv2.USAC_FAST, 1.0, 0.99, 100, densty="paper")
+    assert "density, alpha, dc_percent and scores" in caught.value.__notes__[0]
+    with pytest.raises(cv2.error) as caught:
+        findFundamentalMat(P1, P2, "fast")
+    assert not hasattr(caught.value, "__notes__")
+
+
 def test_keywords_and_positions_mean_the_same():
     by_position = findFundamentalMat(P1, P2, cv2.USAC_MAGSAC, 1.5, 0.99, 500)
     by_name = findFundamentalMat(

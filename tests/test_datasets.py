@@ -108,6 +108,9 @@ class TestMotorcycle:
         assert np.abs(slopes).min() > 5
         assert np.ptp(slopes) > 1
 
+    def test_no_matrix_is_infinitely_wrong(self, pair):
+        assert pair.error(None) == np.inf
+
     def test_error_is_in_pixels(self):
         # F of a rectified pair compares rows; these are 3 px apart in every match.
         F = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])

@@ -292,7 +292,7 @@ class TestCsv:
         ("text", "message"),
         [
             ("1,2,3\n", "line 1: 3 comma-separated columns, expected 4 or 5"),
-            ("1 2 3 4\n", "header '1 2 3 4' is not"),
+            ("1 2 3 4\n", "line 1: 1 comma-separated columns, expected 4 or 5"),
             ("1;2;3;4\n", "header '1;2;3;4' is not"),
             ("1,2,3,4\n1,2,3,4,5\n", "line 2: 5 comma-separated columns, expected 4"),
             ("x,y,x',y'\n1,2,3,4\n1,2,3,4a\n", "line 3: '4a' is not a number"),
