@@ -397,7 +397,6 @@ def _run_match(options: argparse.Namespace) -> int:
         "threshold": options.threshold,
         **_report(X, robust, estimate, plain, timings),
     }
-    written = [str(path) for path in (options.output, options.plot) if path is not None]
     print(json.dumps(report, allow_nan=False) if options.json else _for_people(report))
     if report["F"] is None:
         reason = "cv2's numbers are not finite" if estimate else estimate.reason
@@ -412,6 +411,7 @@ def _run_match(options: argparse.Namespace) -> int:
         with _stage("drawing", timings):
             by_paper = options.density == "paper" and estimate.engine == "density"
             _draw(options.plot, images, X, estimate, alpha if by_paper else None)
+    written = [str(path) for path in (options.output, options.plot) if path is not None]
     if written and not options.json:
         print(f"\nWritten: {', '.join(written)}")
     # Such as that a JPEG file is damaged, but was of use.
