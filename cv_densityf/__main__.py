@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 import cv_densityf
 from cv_densityf._density import density_peaks
-from cv_densityf._engine import GRAPH_CUT_MAX, METHODS, Robust, method_flag
+from cv_densityf._engine import GRAPH_CUT_MAX, METHODS, Robust, method_flag, short_name
 from cv_densityf._epipolar import Floats, residuals
 from cv_densityf._estimate import (
     DENSITIES,
@@ -50,6 +50,7 @@ _LONG = 1000.0
 #: More points than this make a decision graph neither clearer nor quickly.
 _MAX_GRAPH_POINTS = 10_000
 _DEMO_ORDERS = 10
+_PAPERS_ALPHA = 0.011
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -162,7 +163,7 @@ def _output(*suffixes: str) -> Callable[[str], Path]:
 def _add_method(parser: argparse._ActionsContainer, threshold: float, remark: str = "") -> None:
     parser.add_argument(
         "--method",
-        type=lambda name: name.lower().removeprefix("fm_"),
+        type=short_name,
         choices=METHODS,
         default="usac_accurate",
         metavar="NAME",
@@ -206,7 +207,9 @@ def _add_match(commands: argparse._SubParsersAction[Any]) -> None:
         help="how the dense matches are chosen (%(default)s; paper is there for comparison: slower "
         "and less accurate)",
     )
-    estimate.add_argument("--alpha", metavar="A", type=_ALPHA, help="of --density paper (0.011)")
+    estimate.add_argument(
+        "--alpha", metavar="A", type=_ALPHA, help=f"of --density paper ({_PAPERS_ALPHA})"
+    )
     estimate.add_argument("--seed", metavar="N", type=_SEED, default=0, help="(%(default)s)")
     matching = match.add_argument_group("matching, for images")
     matching.add_argument(
@@ -327,7 +330,7 @@ def _run_match(options: argparse.Namespace) -> int:
             options.error(f"--points and {name} exclude each other")
     if options.alpha is not None and options.density != "paper":
         options.error("--alpha is of --density paper")
-    alpha = 0.011 if options.alpha is None else options.alpha
+    alpha = _PAPERS_ALPHA if options.alpha is None else options.alpha
     if options.plot is not None:
         from cv_densityf import plotting
 

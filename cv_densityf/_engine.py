@@ -45,6 +45,11 @@ GRAPH_CUT_MAX = 30_000
 _USAC_FLAGS = range(cv2.USAC_DEFAULT, cv2.USAC_MAGSAC + 1)
 
 
+def short_name(method: str) -> str:
+    """Write a method's name as the keys of `METHODS` are: ``"FM_RANSAC"`` is ``"ransac"``."""
+    return method.lower().removeprefix("fm_")
+
+
 def method_flag(method: str | int) -> int:
     """Turn a method's name, or its cv2 constant, into the cv2 constant.
 
@@ -54,7 +59,7 @@ def method_flag(method: str | int) -> int:
         If the name or the constant is not one of cv2's.
     """
     if isinstance(method, str):
-        name = method.lower().removeprefix("fm_")
+        name = short_name(method)
         if name in METHODS:
             return METHODS[name]
     elif isinstance(method, Integral) and type(method) is not bool and method in METHODS.values():
