@@ -53,6 +53,8 @@ INLIER_RATIO, NOISE = 0.3, 0.5
 N_PAIRS, PAIR_SIZE, RUNS = 200, 1_000, 5
 #: Scenes over which the time of one pair is the median.
 N_COSTED = 10
+#: Calls on matches of which none is right are timed up to here: cv2's RANSAC takes all its samples.
+MAX_HOPELESS = 10_000
 #: Inlier ratios at which a search on a part is held against one on all matches.
 RATIOS = (0.1, 0.2, 0.3, 0.5)
 #: Pixels between the matches of a real pair's optical flow, and the share of them made wrong.
@@ -118,6 +120,8 @@ def scale(
         raise ValueError("numbers of matches start at 2, scenes at 1")
     with one_thread():
         calls = measure_calls(numbers, scenes, kind)
+        few = [n for n in numbers if n <= MAX_HOPELESS]
+        hopeless = measure_calls(few, scenes, kind, inlier_ratio=0.0)
         parted = measure_parts([n for n in numbers if n <= FIT[1]], scenes, kind)
         dense = measure_dense()
         clustering = measure_clustering(cluster_numbers, scenes, kind)
@@ -131,6 +135,7 @@ def scale(
         parts += [
             "## Time, ms\n\n" + _times(calls, numbers),
             f"## Time / {RIVAL}\n\n" + _times(calls, numbers, RIVAL),
+            f"## Time / {RIVAL}, no match right\n\n" + _times(hopeless, few, RIVAL),
             "## Error, px\n\n" + _errors(calls, numbers),
             *(["## Error / searching all matches\n\n" + _parts_table(parted)] if parted else []),
             "## Error on optical flow, px\n\n" + _errors(dense, list(dense[RIVAL].ms)),
@@ -153,14 +158,16 @@ def scale(
     return "\n\n".join(parts) + "\n"
 
 
-def measure_calls(numbers: Sequence[int], scenes: int, kind: str) -> dict[str, Series]:
+def measure_calls(
+    numbers: Sequence[int], scenes: int, kind: str, inlier_ratio: float = INLIER_RATIO
+) -> dict[str, Series]:
     """Time the whole call of each method, and the filter alone on all matches."""
     methods, _ = choose(list(CALLS))
     estimators = {m.name: _with_defaults(m) for m in methods}
     series = {name: Series() for name in (*estimators, SEARCH_ALL, FILTER)}
     warm_up(methods, Settings())
     for n in numbers:
-        for pair in _scenes(kind, n, scenes):
+        for pair in _scenes(kind, n, scenes, inlier_ratio):
             for name, estimate in estimators.items():
                 _add(series[name], pair, estimate)
             if _estimate.MAX_SEARCHED < n <= MAX_SEARCH_ALL:
@@ -349,9 +356,9 @@ def measure_costs(kind: str) -> dict[str, float]:
     return costs
 
 
-def _scenes(kind: str, n: int, scenes: int) -> Iterable[Pair]:
+def _scenes(kind: str, n: int, scenes: int, inlier_ratio: float = INLIER_RATIO) -> Iterable[Pair]:
     for seed in range(scenes if n <= FIT[1] else 1):
-        yield make_scene(kind, n, INLIER_RATIO, NOISE, seed)
+        yield make_scene(kind, n, inlier_ratio, NOISE, seed)
 
 
 def _add(series: Series, pair: Pair, call: Callable[[Pair], Any], has_error: bool = True) -> None:

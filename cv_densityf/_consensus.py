@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -41,6 +41,8 @@ ROUNDS = (
     (0.5, BY_SCORE, NEAR),
     (0.25, 1.0),
 )
+#: So many of them where matches lie together only as by chance: such a pair hardly has right ones.
+_ROUNDS_BY_CHANCE = 2
 _NEAR_WIDTH = 8.0
 #: What the draws agree on may be one of several motions: with more than this share of the reliable
 #: half unexplained, one more draw is from all that is unexplained, before they may end. A motion
@@ -121,7 +123,7 @@ class Consensus:
 
 def search(
     X: Floats,
-    rankings: Iterable[NDArray[np.float64]],
+    rankings: Iterable[tuple[NDArray[np.float64], bool]],
     *,
     threshold: float,
     confidence: float,
@@ -138,18 +140,20 @@ def search(
     the best hypothesis so far leaves near its epipolar lines: a nearly right F has the right one's
     inliers there. Each hypothesis is polished on all matches. The draws end when a second,
     independent one arrives at the best hypothesis's inliers, and one from what these leave, if that
-    is much, is no better; or after `ROUNDS` on each ranking. Where most inliers are on a plane,
-    other hypotheses of that plane are then tried. Unless two draws are nearly the same, the best
-    hypothesis is optimised locally; where none agree, another one as well.
+    is much, is no better; or after `ROUNDS` on each ranking, sooner where there is little hope.
+    Where most inliers are on a plane, other hypotheses of that plane are then tried. Unless two
+    draws are nearly the same, the best hypothesis is optimised locally; where none agree, another
+    one as well.
 
     Parameters
     ----------
     X : array, shape (n, 4)
         Finite matches.
-    rankings : iterable of array, shape (n,)
+    rankings : iterable of (array of shape (n,), bool)
         Reliability of each match: the weight of its vote, in [0, 1], and its place in the order of
         the draws. NaN where it is not known: such a match is in no draw by density and has half a
-        vote. Where no two draws agree the search begins anew with the next one.
+        vote. With it, whether the matches lie together more than by chance; if not, there are few
+        rounds. Where no two draws agree the search begins anew with the next ranking.
     threshold : float
         Of the draws, pixels. The mask has one of its own, the caller's.
     confidence, max_iters
@@ -179,11 +183,14 @@ def search(
     rng = np.random.default_rng(abs(seed))
     n_draws = 0
     pool: _Pool | None = None
-    for ranking in rankings:
+    for ranking, crowded in rankings:
         order = np.argsort(-ranking, kind="stable")[: np.count_nonzero(ranking >= 0.0)]
         reliable = order[: max(MIN_DRAW, len(order) // 2)]
         latest = _Pool(X, np.nan_to_num(ranking, nan=0.5), reliable, threshold, rng, frame)
-        made, agreed = _fill(latest, X, order, scores, confidence, max_iters, seed + n_draws, watch)
+        rounds = ROUNDS if crowded else ROUNDS[:_ROUNDS_BY_CHANCE]
+        made, agreed = _fill(
+            latest, X, order, rounds, scores, confidence, max_iters, seed + n_draws, watch
+        )
         n_draws += made
         if len(latest):
             pool, reliability = latest, ranking
@@ -200,6 +207,8 @@ def search(
     watch.lap("polish")
     again = ", found again by another" if agreed and pool.agrees_off_plane() else ""
     reason = f"the hypothesis with {pool.virtue} of {n_draws} draws{again}"
+    if not crowded:
+        reason += ", though matches lie together no more than by chance"
     return Consensus(F, reliability, tuple(pool.votes.tolist()), n_draws, reason)
 
 
@@ -216,6 +225,7 @@ def _fill(
     pool: _Pool,
     X: Floats,
     order: Ints,
+    rounds: Sequence[tuple[float, ...]],
     scores: Floats | None,
     confidence: float,
     max_iters: int,
@@ -225,7 +235,7 @@ def _fill(
     """Make rounds of draws until two of them agree; how many it took, and whether they do."""
     points = X[order].astype(np.float32)
     n_draws, agreed, asked_rest = 0, False, False
-    for fractions in ROUNDS:
+    for fractions in rounds:
         parts = []
         for fraction in fractions:
             by_score = fraction == BY_SCORE

@@ -238,18 +238,23 @@ def _search_threshold(spread: float, robust: Robust, density: str) -> float:
 
 def _rankings(
     X: NDArray[np.float64], trust: NDArray[np.float64] | None, seed: int, watch: Stopwatch
-) -> Iterator[NDArray[np.float64]]:
-    """Reliability of a part of the better half by score, spread if it is large; then of all."""
+) -> Iterator[tuple[NDArray[np.float64], bool]]:
+    """Reliability of a part of the better half by score, spread if it is large; then of all.
+
+    With each, whether the matches lie together more than by chance; if not, there is one only.
+    """
     n = len(X)
     if n > MAX_RANKED:
         better = np.arange(n) if trust is None else best_scored(trust, max(n // 2, MAX_RANKED))
         rows = better[_spread(X[better], MAX_RANKED, np.random.default_rng(abs(seed)))]
-        reliability, _ = contrast_support(X, trust, rows)
+        reliability, _, crowded = contrast_support(X, trust, rows)
         watch.lap("density")
-        yield reliability
-    reliability, _ = contrast_support(X, trust)
+        yield reliability, crowded
+        if not crowded:
+            return
+    reliability, _, crowded = contrast_support(X, trust)
     watch.lap("density")
-    yield reliability
+    yield reliability, crowded
 
 
 def _spread(X: NDArray[np.float64], size: int, rng: np.random.Generator) -> NDArray[np.intp]:

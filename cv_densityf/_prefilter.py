@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,11 @@ _KD_TREE: dict[str, bool | int | float | str] = {"algorithm": 4}
 _EXACT: dict[str, bool | int | float | str] = {"checks": -1}
 #: Squared distances beyond would not fit in float32.
 _FARTHEST = 1e18
+#: Matches lie together more than by chance if their mean contrast exceeds its expectation by this
+#: much, a thirtieth of what it is where all are right, or by so many standard deviations. Between
+#: photographs of two scenes texture alone makes half of that.
+_EXCESS = 0.1
+_SIGNIFICANT = 6.0
 #: Of the caller's scores the worst part, one match in so many, is no witness for others.
 _WORST = 5
 #: Rows compared at a time, so that the comparison table stays in the cache.
@@ -87,6 +94,30 @@ def density_contrast(
     return contrast
 
 
+def beyond_chance(contrast: Floats, n: int, n_among: int) -> bool:
+    """Whether n matches lie together more than those of two images without a common scene.
+
+    Were the matches paired at random, with neighbourhoods of k among l of them, the a-th neighbour
+    in one image would be the b-th in the other with probability 1 / (l - 1), and add 1 / max(a, b)
+    to the contrast. Since neighbours mostly come in twos, each other's, the mean over n matches
+    then has up to twice the variance of independent ones.
+
+    Parameters
+    ----------
+    contrast : array, shape (m,)
+        `density_contrast` of the n matches, or of a part of them that stands for all.
+    n : int
+        Number of matches.
+    n_among : int
+        Number of those that count as neighbours.
+    """
+    rank = np.arange(1, min(N_NEIGHBORS, n_among - 1) + 1)
+    pairs = (2 * rank - 1) / (n_among - 1)
+    deviation = np.sqrt(2 * (pairs / rank**2).sum() / n)
+    excess = contrast.mean() - (pairs / rank).sum()
+    return bool(excess > min(_EXCESS, _SIGNIFICANT * deviation))
+
+
 def ranks(values: Floats) -> NDArray[np.float64]:
     """Rank of each value, from 0 for the smallest to 1 for the largest; equal values share one."""
     ordered = np.sort(values)
@@ -105,10 +136,18 @@ def best_scored(scores: Floats, size: int) -> Ints:
     return np.flatnonzero(scores >= np.partition(scores, worse)[worse])
 
 
-def contrast_support(
-    X: Floats, scores: Floats | None = None, rows: Ints | None = None
-) -> tuple[NDArray[np.float64], Bools]:
+class Support(NamedTuple):
+    """What `contrast_support` says."""
+
+    reliability: NDArray[np.float64]
+    kept: Bools
+    crowded: bool
+
+
+def contrast_support(X: Floats, scores: Floats | None = None, rows: Ints | None = None) -> Support:
     """Rank in [0, 1] of each match's density contrast, 1 for the most reliable; the denser half.
+
+    And whether the matches lie together more than by chance, see `beyond_chance`.
 
     With ``scores`` (n,), higher for more trusted matches, both count: see `with_scores`; and the
     worst fifth by score does not count as neighbours. With ``rows`` (m,) only these are looked at,
@@ -118,12 +157,14 @@ def contrast_support(
     if rows is None:
         rows = np.arange(n)
     among = None if scores is None else best_scored(scores, n - n // _WORST)
-    ranked = ranks(density_contrast(X, rows=rows, among=among))
+    contrast = density_contrast(X, rows=rows, among=among)
+    crowded = beyond_chance(contrast, n, n if among is None else len(among))
+    ranked = ranks(contrast)
     if scores is not None:
         ranked = with_scores(ranked, scores[rows])
     reliability = np.full(n, np.nan)
     reliability[rows] = ranked
-    return reliability, reliability >= 0.5
+    return Support(reliability, reliability >= 0.5, crowded)
 
 
 def paper_support(X: Floats, alpha: float, dc_percent: float) -> tuple[NDArray[np.float64], Bools]:

@@ -33,10 +33,10 @@ SEEDS = range(4)
 ASKED = {"threshold": 1.0, "confidence": 0.999, "max_iters": 5000}
 
 
-def find(X, reliability=None, *, seed=0, **asked):
+def find(X, reliability=None, *, crowded=True, seed=0, **asked):
     if reliability is None:
         reliability = contrast_support(X)[0]
-    return search(X, [reliability], seed=seed, watch=Stopwatch(), **{**ASKED, **asked})
+    return search(X, [(reliability, crowded)], seed=seed, watch=Stopwatch(), **{**ASKED, **asked})
 
 
 def true_matches(seed, n=400):
@@ -288,6 +288,21 @@ def test_two_different_answers_are_no_agreement(monkeypatch):
     found = find(X)
     assert found.n_draws >= 2 * len(_consensus.ROUNDS) - 1
     assert len(found.votes) == found.n_draws
+    assert "chance" not in found.reason
+
+
+def test_matches_that_lie_together_only_as_by_chance_get_few_rounds(monkeypatch):
+    scene = scene_of(0)
+    draws = spied_draws(monkeypatch, lambda *_, **__: None)
+    assert find(scene.X, crowded=False) is None
+    made = len(draws)
+    assert find(scene.X) is None
+    assert 2 <= made < 0.6 * (len(draws) - made)
+    monkeypatch.undo()
+    assert "chance" not in find(scene.X).reason
+    assert find(scene.X, crowded=False).reason.endswith(
+        ", though matches lie together no more than by chance"
+    )
 
 
 def test_more_than_the_reliable_part_counts():
@@ -677,7 +692,7 @@ def test_the_next_ranking_is_asked_for_where_no_two_draws_agree(monkeypatch):
     def rankings(*tried):
         for reliability in tried:
             asked.append(reliability)
-            yield reliability
+            yield reliability, True
 
     options = {"seed": 0, "watch": Stopwatch(), **ASKED}
     easy = search(scene.X, rankings(told, misled), **options)
@@ -696,7 +711,7 @@ def test_the_next_ranking_is_asked_for_where_no_two_draws_agree(monkeypatch):
     np.testing.assert_array_equal(found.reliability, told)
     np.testing.assert_array_equal(easy.reliability, told)
     assert sampson_distance(found.F, true_matches(0)).mean() < 0.2
-    alone = search(scene.X, [misled], **options)
+    alone = search(scene.X, [(misled, True)], **options)
     assert sampson_distance(alone.F, true_matches(0)).mean() > 1.0
 
 
@@ -705,7 +720,7 @@ def test_a_ranking_without_any_draw_leaves_what_the_one_before_found(monkeypatch
     first, second = contrast_support(X)[0], np.linspace(0.0, 1.0, len(X))
     monkeypatch.setattr(_Pool, "agrees", lambda *_: False)
     options = {"watch": Stopwatch(), **ASKED}
-    alone = search(X, [first], seed=0, **options)
+    alone = search(X, [(first, True)], seed=0, **options)
 
     def draw(points, threshold, confidence, max_iters, seed, best_first=False):
         if seed < alone.n_draws:
@@ -713,7 +728,7 @@ def test_a_ranking_without_any_draw_leaves_what_the_one_before_found(monkeypatch
         return None
 
     monkeypatch.setattr(_consensus, "draw", draw)
-    found = search(X, [first, second], seed=0, **options)
+    found = search(X, [(first, True), (second, True)], seed=0, **options)
     assert found.n_draws > alone.n_draws
     np.testing.assert_array_equal(found.F, alone.F)
     assert found.reliability is first
@@ -745,7 +760,7 @@ def test_the_watch_tells_draws_from_the_rest(monkeypatch):
     monkeypatch.setattr(_Pool, "agrees", lambda *_: False)
     watch = Stopwatch()
     X = scene_of(0).X
-    found = search(X, [contrast_support(X)[0]], seed=0, watch=watch, **ASKED)
+    found = search(X, [(contrast_support(X)[0], True)], seed=0, watch=watch, **ASKED)
     draws = 1000 * found.n_draws
     assert watch.laps == {"draws": draws, "polish": 1000 * now - draws}
 

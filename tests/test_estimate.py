@@ -716,6 +716,18 @@ def test_all_matches_vote_on_what_a_part_has_found(monkeypatch):
     assert np.median(sampson_distance(estimate(X).F, right.X)) > 5.0
 
 
+@pytest.mark.parametrize("n", [200, 1500])
+def test_a_pair_without_a_common_scene_gets_few_draws(n):
+    """Half of those of a hard pair, and no second search among all of more than a thousand."""
+    scene = two_view_scene(n, inlier_ratio=0.3, random_state=0)
+    wrong = np.random.default_rng(0).permutation(scene.points2)
+    estimate = estimate_fundamental(scene.points1, wrong)
+    assert "by chance" in estimate.reason
+    assert estimate.n_draws <= 5
+    assert np.isnan(estimate.reliability).sum() == max(n - 1000, 0)
+    assert "by chance" not in estimate_fundamental(scene.points1, scene.points2).reason
+
+
 def test_copies_of_a_match_do_not_end_the_search():
     """Samples of the local optimisation may be copies of one match, which fix no F."""
     for seed in range(8):

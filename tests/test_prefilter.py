@@ -94,6 +94,36 @@ def test_contrast_does_not_depend_on_how_the_work_is_cut(monkeypatch):
     np.testing.assert_array_equal(density_contrast(X), whole)
 
 
+def paired_at_random(seed, n):
+    """A scene's points, wherever there is texture, each with any point of the other image."""
+    X = scene_of(seed, n).X
+    return np.hstack([X[:, :2], np.random.default_rng(seed).permutation(X[:, 2:])])
+
+
+@pytest.mark.parametrize("n", [40, 300])
+def test_what_chance_makes_of_the_contrast_is_known(n, monkeypatch):
+    """Random pairings exceed their expectation half of the time, by three deviations never."""
+    pairings = [paired_at_random(seed, n) for seed in range(60)]
+    monkeypatch.setattr(_prefilter, "_EXCESS", np.inf)
+    for deviations, least, most in ((0, 0.3, 0.7), (3, 0.0, 0.0)):
+        monkeypatch.setattr(_prefilter, "_SIGNIFICANT", deviations)
+        assert least <= np.mean([contrast_support(X).crowded for X in pairings]) <= most
+
+
+@pytest.mark.parametrize("n", [60, 300, 1500])
+@pytest.mark.parametrize("scored", [False, True])
+def test_right_matches_lie_together_more_than_by_chance(n, scored):
+    rng = np.random.default_rng(n)
+    some = rng.permutation(n)[: n // 2]
+    scores = rng.uniform(size=n) if scored else None
+    for rows in (None, some):
+        together = [contrast_support(scene_of(seed, n).X, scores, rows).crowded for seed in SEEDS]
+        by_chance = [
+            contrast_support(paired_at_random(seed, n), scores, rows).crowded for seed in SEEDS
+        ]
+        assert (all(together), any(by_chance)) == (True, False)
+
+
 @pytest.mark.parametrize("n", [3, 40, 300])
 def test_contrast_of_some_rows_is_theirs_among_all(n):
     X = scene_of(4, n).X
@@ -104,7 +134,7 @@ def test_contrast_of_some_rows_is_theirs_among_all(n):
 def test_rows_that_are_not_looked_at_are_neither_reliable_nor_kept():
     X = scene_of(5).X
     rows = np.arange(0, 400, 3)
-    reliability, kept = contrast_support(X, rows=rows)
+    reliability, kept, _ = contrast_support(X, rows=rows)
     np.testing.assert_array_equal(reliability[rows], ranks(density_contrast(X)[rows]))
     others = np.delete(np.arange(400), rows)
     assert np.isnan(reliability[others]).all()
@@ -185,7 +215,7 @@ def test_contrast_does_not_care_which_image_comes_first_nor_for_the_order(seed):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_right_matches_rank_above_wrong_ones(seed):
     scene = scene_of(seed, 600, inlier_ratio=0.3)
-    reliability, kept = contrast_support(scene.X)
+    reliability, kept, _ = contrast_support(scene.X)
     assert auc(reliability, scene.inliers) > 0.8
     top = np.argsort(-reliability)[:90]
     assert scene.inliers[top].mean() > 0.8
@@ -210,7 +240,7 @@ def test_ranks_run_from_zero_to_one_and_ties_share_one():
 
 def test_reliability_is_the_rank_of_the_contrast_and_the_better_half_is_kept():
     X = scene_of(3, 101).X
-    reliability, kept = contrast_support(X)
+    reliability, kept, _ = contrast_support(X)
     np.testing.assert_array_equal(reliability, ranks(density_contrast(X)))
     assert kept.dtype == bool
     assert kept.sum() == 51
