@@ -77,8 +77,8 @@ _LOCAL_STEPS = 2
 _LOCAL_SAMPLES = 16
 #: Where none do, the right F may be next to another hypothesis than the best: number of samples
 #: from each of so many, whose inliers have less than this intersection over union.
-_LOCAL_SAMPLES_IN_DOUBT = 32
-_LOCAL_STARTS_IN_DOUBT = 2
+_LOCAL_SAMPLES_IN_DOUBT = 64
+_LOCAL_STARTS_IN_DOUBT = 3
 _SAME_BASIN = 0.8
 #: Widths of the vote, in units of the working threshold.
 _VOTE_WIDTHS = np.array([0.3, 0.5, 0.8, 1.3])
@@ -142,8 +142,8 @@ def search(
     independent one arrives at the best hypothesis's inliers, and one from what these leave, if that
     is much, is no better; or after `ROUNDS` on each ranking, sooner where there is little hope.
     Where most inliers are on a plane, other hypotheses of that plane are then tried. Unless two
-    draws are nearly the same, the best hypothesis is optimised locally; where none agree, another
-    one as well.
+    draws are nearly the same, the best hypothesis is optimised locally; where none agree, others as
+    well.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def search(
         return None
     pool.complete()
     if not pool.agrees(_CLOSE_AGREEMENT):
-        pool.optimise()
+        pool.optimise(crowded)
         agreed = pool.agrees()
     F = pool.refined_best() if others is None else pool.before(others - centre).settled_best()
     F = shift(-centre[2:]).T @ F @ shift(-centre[:2])
@@ -389,13 +389,15 @@ class _Pool:
             self._off_plane = off_plane
             self._join(G, np.zeros(len(G)))
 
-    def optimise(self) -> None:
-        """Optimise the best hypothesis locally; if draws do not agree on it, another one as well.
+    def optimise(self, crowded: bool = True) -> None:
+        """Optimise the best hypothesis locally; if draws do not agree on it, others as well.
+
+        Not so where matches lie together only as by chance: there is hardly a right one.
 
         The inner sampling of Chum, Matas and Kittler, "Locally optimized RANSAC" (2003), with the
         vote as its score.
         """
-        if self.agrees():
+        if self.agrees() or not crowded:
             self._optimise_from(self.best, _LOCAL_SAMPLES)
         else:
             for start in self._finalists(_LOCAL_STARTS_IN_DOUBT, _SAME_BASIN):

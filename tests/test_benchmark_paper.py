@@ -95,12 +95,31 @@ def test_the_page_holds_the_tables_of_the_report_and_its_own_words(quick):
 
 def test_draws_are_as_large_as_the_paper_s_and_differ(quick):
     pair = make_scene("clusters", 800, 0.5, 0.5)
-    first, again, other = (paper.draw(pair, "all matches", seed) for seed in (0, 0, 1))
+    first, again, other = (paper.draw(pair.X, seed) for seed in (0, 0, 1))
     assert first.shape == (paper.N_PAPER, 4)
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other)
-    cut = paper.draw(pair, "SIFT ratio < 0.8", 0, most=None)
-    assert set(map(tuple, cut)) == set(map(tuple, pair.X[pair.scores > 0.2]))
+    assert len(paper.draw(pair.X[:200], 0)) == 200
+
+
+def test_cuts_thin_out_the_matches():
+    views = paper.motorcycle()
+    one_way, mutual, best = (views.matches(cut) for cut in paper.CUTS)
+    assert set(map(tuple, best)) == set(map(tuple, views.pair.X[views.pair.scores > 0.2]))
+    for fewer, more in ((best, mutual), (mutual, one_way)):
+        assert set(map(tuple, fewer)) < set(map(tuple, more))
+
+
+def test_the_growth_of_ransacs_time_is_over_that_at_the_largest_threshold(quick):
+    header, rows = tables((quick / "paper.md").read_text())[
+        "RANSAC's time / that at 2.2 px, real pairs"
+    ]
+    assert header[1:-1] == ["th 2.2", "th 1", "th 0.8", "th 0.5"]
+    assert rows[0] == ["the paper", "1.0", "2.2", "7.1", "26.8", ""]
+    assert [row[0] for row in rows[1:]] == list(paper.CUTS)
+    for row in rows[1:]:
+        assert row[1] == "1.0 [1.0 to 1.0]"
+        assert 0 < float(row[-1].split()[0]) <= 1
 
 
 @pytest.mark.parametrize("method", [paper.PROPOSED, paper.PROPOSED_CV2])

@@ -227,8 +227,11 @@ def test_local_optimisation_finds_more_votes_near_a_poor_hypothesis(seed):
     assert not pool.agrees()
 
 
-@pytest.mark.parametrize(("sizes", "samples"), [((60, 150), [16]), ((60, 60), [32, 32])])
-def test_a_rival_is_optimised_only_where_no_draws_agree(monkeypatch, sizes, samples):
+@pytest.mark.parametrize(
+    ("sizes", "crowded", "samples"),
+    [((60, 150), True, [16]), ((60, 60), True, [64, 64]), ((60, 60), False, [16])],
+)
+def test_rivals_are_optimised_only_where_no_draws_agree(monkeypatch, sizes, crowded, samples):
     X = np.vstack([true_matches(0, n=250), true_matches(50, n=150)])
     X -= X.mean(axis=0)
     larger, smaller = eight_point(X[None, :250]), eight_point(X[None, 250:])
@@ -236,7 +239,7 @@ def test_a_rival_is_optimised_only_where_no_draws_agree(monkeypatch, sizes, samp
     pool.add(np.concatenate([larger, larger, smaller]), [*sizes, 100])
     starts = []
     monkeypatch.setattr(_Pool, "_optimise_from", lambda pool, *start: starts.append(start))
-    pool.optimise()
+    pool.optimise(crowded)
     assert [n_samples for _, n_samples in starts] == samples
     assert [start for start, _ in starts] == [pool.best, 2][: len(samples)]
 
