@@ -464,6 +464,9 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
     threshold_ : float
         Largest distance of an inlier, in pixels: ``threshold``, or what "lmeds" derived from the
         rows of fit.
+    reason_ : str
+        One sentence on how F_ came about: whether draws agree, and whether the matches lie together
+        more than by chance; or that cv2's own call made it.
     n_features_in_ : int
         Always 4.
     feature_names_in_ : ndarray of str, shape (4,)
@@ -585,7 +588,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
                 answer = self.prefilter_.fit_predict(matches, **prefilter_params)
                 candidates = _enough(_as_mask(answer, len(matches)))
             F, candidates = _plain_estimate(matches, candidates, robust)
-            reason = "cv2 found none"
+            reason = "cv2's own call"
         if F is None or not np.isfinite(F).all():
             raise ValueError(
                 f"no fundamental matrix was found from {len(matches)} matches ({reason}); try a "
@@ -593,6 +596,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
                 "or matches that are not all on one line or plane"
             )
         self.F_: NDArray[np.float64] = F
+        self.reason_: str = reason
         self.candidate_mask_: NDArray[np.bool_] = candidates
         self._set_rule(robust, matches)
         self.inlier_mask_: NDArray[np.bool_] = self._inliers(matches)

@@ -150,6 +150,7 @@ def test_auto_is_the_pipeline(scene, method):
     np.testing.assert_array_equal(estimator.F_, expected.F)
     np.testing.assert_array_equal(estimator.inlier_mask_, expected.mask)
     np.testing.assert_array_equal(estimator.candidate_mask_, expected.kept)
+    assert estimator.reason_ == expected.reason
 
 
 @pytest.mark.parametrize(
@@ -166,6 +167,7 @@ def test_a_prefilter_decides_the_candidates(scene, prefilter):
     F, _ = cv2.findFundamentalMat(X[kept, :2], X[kept, 2:], cv2.USAC_MAGSAC, 1.0, 0.999, 5000)
     np.testing.assert_array_equal(estimator.F_, F)
     assert estimator.inlier_mask_[~kept].any()
+    assert estimator.reason_ == "cv2's own call"
     assert isinstance(estimator.prefilter_, type(prefilter))
     assert estimator.prefilter_ is not prefilter
 
