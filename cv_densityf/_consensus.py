@@ -119,6 +119,8 @@ class Consensus:
     votes: tuple[float, ...]
     n_draws: int
     reason: str
+    #: Whether the matches lie together more than by chance.
+    crowded: bool = True
 
 
 def search(
@@ -209,7 +211,7 @@ def search(
     reason = f"the hypothesis with {pool.virtue} of {n_draws} draws{again}"
     if not crowded:
         reason += ", though matches lie together no more than by chance"
-    return Consensus(F, reliability, tuple(pool.votes.tolist()), n_draws, reason)
+    return Consensus(F, reliability, tuple(pool.votes.tolist()), n_draws, reason, crowded)
 
 
 class _Part(NamedTuple):

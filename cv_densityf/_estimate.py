@@ -80,6 +80,10 @@ class Estimate:
         for those of a dominant plane, and for that of the local optimisation, where there were any.
         Of many matches, those of the part that searched. Where a plane is dominant, the winner's
         need not be the largest: the number of inliers off the plane decides.
+    crowded : bool
+        Whether the matches lie together more than by chance, as right ones do. Those of images that
+        have nothing in common mostly do not, however many inliers there are. True where the density
+        was not looked at, too: where cv2's own call answered, and for ``density="paper"``.
 
     See Also
     --------
@@ -95,6 +99,7 @@ class Estimate:
     reason: str
     timings: dict[str, float] = field(default_factory=dict)
     votes: tuple[float, ...] = ()
+    crowded: bool = True
 
     def __bool__(self) -> bool:
         return self.F is not None
@@ -223,6 +228,7 @@ def _estimate(
         reason=found.reason,
         timings=watch.laps,
         votes=found.votes,
+        crowded=found.crowded,
     )
 
 

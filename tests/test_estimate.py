@@ -723,9 +723,13 @@ def test_a_pair_without_a_common_scene_gets_few_draws(n):
     wrong = np.random.default_rng(0).permutation(scene.points2)
     estimate = estimate_fundamental(scene.points1, wrong)
     assert "by chance" in estimate.reason
+    assert not estimate.crowded
     assert estimate.n_draws <= 5
     assert np.isnan(estimate.reliability).sum() == max(n - 1000, 0)
-    assert "by chance" not in estimate_fundamental(scene.points1, scene.points2).reason
+    right = estimate_fundamental(scene.points1, scene.points2)
+    assert "by chance" not in right.reason
+    assert right.crowded
+    assert estimate_fundamental(scene.points1, wrong, density="off").crowded
 
 
 def test_copies_of_a_match_do_not_end_the_search():
