@@ -37,6 +37,8 @@ N_VIEWS = 12
 ARC = 100.0
 #: The corridor's walls would stand between the arc and the scene.
 ARC_SCENES = tuple(name for name in SCENES if name != "corridor")
+#: COLMAP's number of a pair of images: the first one's id times this and the second one's.
+PAIR_BASE = 2**31 - 1
 #: SIFT ratio below which COLMAP keeps a match: its default, and no ratio test.
 RATIOS = {"ratio 0.8": 0.8, "no ratio test": 1.0}
 
@@ -69,11 +71,75 @@ class Model:
     seconds: float
 
 
+@dataclass(frozen=True)
+class Mixture:
+    """Verified pairs of views of one scene, and of two, and the time by the clock, seconds."""
+
+    right: int
+    wrong: int
+    seconds: float
+
+
 def compare(name: str, ratio: float, folder: Path, seed: int = 0) -> dict[str, Model]:
     """Map one rendered scene on both verifications of the same matches."""
+    views = render_views(name)
+    matched = match_views(views, folder, ratio)
+    # Starts the worker processes, which a long run does not notice.
+    verify_matches(matched, n_jobs=-1, dry_run=True)
+    models = {}
+    for verifier, verify in verifiers(seed).items():
+        database = folder / f"{verifier}.db"
+        shutil.copy(matched, database)
+        start = time.perf_counter()
+        verify(database)
+        seconds = time.perf_counter() - start
+        models[verifier] = map_images(
+            database, folder / "images", folder / verifier, views, seconds, seed
+        )
+    return models
+
+
+def mix(names: Sequence[str], ratio: float, folder: Path, seed: int = 0) -> dict[str, Mixture]:
+    """Verify the matches between all views of several scenes, those of different ones all wrong."""
+    views = [view for name in names for view in render_views(name)]
+    matched = match_views(views, folder, ratio)
+    found = {}
+    for verifier, verify in verifiers(seed).items():
+        database = folder / f"{verifier}.db"
+        shutil.copy(matched, database)
+        start = time.perf_counter()
+        verify(database)
+        seconds = time.perf_counter() - start
+        with contextlib.closing(sqlite3.connect(database)) as connection:
+            name_of = dict(connection.execute("SELECT image_id, name FROM images"))
+            pairs = connection.execute("SELECT pair_id FROM two_view_geometries WHERE rows > 0")
+            scenes = [
+                {int(name_of[i][:-4]) // N_VIEWS for i in divmod(pair_id, PAIR_BASE)}
+                for (pair_id,) in pairs
+            ]
+        right = sum(len(scene) == 1 for scene in scenes)
+        found[verifier] = Mixture(right, len(scenes) - right, seconds)
+    return found
+
+
+def verifiers(seed: int) -> dict[str, Callable[[Path], object]]:
+    """Give the two ways to verify the matches of a database, each with its defaults."""
     import pycolmap
 
-    views = render_views(name)
+    geometry = pycolmap.TwoViewGeometryOptions()
+    geometry.ransac.random_seed = seed
+    return {
+        "pycolmap": lambda path: pycolmap.geometric_verification(
+            path, two_view_geometry_options=geometry
+        ),
+        "cv-densityf": lambda path: verify_matches(path, n_jobs=-1, random_state=seed),
+    }
+
+
+def match_views(views: Sequence[View], folder: Path, ratio: float) -> Path:
+    """Write the images, let pycolmap find and match their features; return its database."""
+    import pycolmap
+
     images = folder / "images"
     images.mkdir(parents=True)
     for i, view in enumerate(views):
@@ -93,27 +159,7 @@ def compare(name: str, ratio: float, folder: Path, seed: int = 0) -> dict[str, M
     if ratio >= 1:
         options.sift.max_distance = 2.0
     pycolmap.match_exhaustive(matched, options)
-    geometry = pycolmap.TwoViewGeometryOptions()
-    geometry.ransac.random_seed = seed
-
-    def theirs(path: Path) -> None:
-        pycolmap.geometric_verification(path, two_view_geometry_options=geometry)
-
-    # Starts the worker processes, which a long run does not notice.
-    verify_matches(matched, n_jobs=-1, dry_run=True)
-    verifiers: dict[str, Callable[[Path], object]] = {
-        "pycolmap": theirs,
-        "cv-densityf": lambda path: verify_matches(path, n_jobs=-1, random_state=seed),
-    }
-    models = {}
-    for verifier, verify in verifiers.items():
-        database = folder / f"{verifier}.db"
-        shutil.copy(matched, database)
-        start = time.perf_counter()
-        verify(database)
-        seconds = time.perf_counter() - start
-        models[verifier] = map_images(database, images, folder / verifier, views, seconds, seed)
-    return models
+    return matched
 
 
 def render_views(name: str) -> list[View]:
@@ -209,7 +255,7 @@ def similarity(source: Floats, target: Floats) -> tuple[float, Floats, Floats]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print a table of every scene, with and without a ratio test."""
+    """Print tables of every scene, and of two together, with and without a ratio test."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.sfm", description=__doc__)
     parser.add_argument("--scenes", nargs="+", choices=ARC_SCENES, default=ARC_SCENES)
     parser.add_argument("--seed", type=int, default=0)
@@ -233,10 +279,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     n_pairs = N_VIEWS * (N_VIEWS - 1) // 2
     title = f"{N_VIEWS} views of {SIZE[0]} x {SIZE[1]}, {n_pairs} pairs"
     text = f"## {title}\n\n{_table(header, body)}"
+    if len(args.scenes) > 1:
+        two = args.scenes[:2]
+        text += f"\n\n## Views of {' and '.join(two)} together\n\n{_mixtures(two, args.seed)}"
     print(text)
     if args.page:
         fill(args.page, text)
     return 0
+
+
+def _mixtures(names: Sequence[str], seed: int) -> str:
+    n_right = len(names) * N_VIEWS * (N_VIEWS - 1) // 2
+    n_wrong = len(names) * N_VIEWS * (len(names) * N_VIEWS - 1) // 2 - n_right
+    body = []
+    for kind, ratio in tqdm(RATIOS.items(), unit="mixture"):
+        with tempfile.TemporaryDirectory() as folder:
+            found = mix(names, ratio, Path(folder) / "sfm", seed)
+        own = found["pycolmap"].seconds
+        for verifier, m in found.items():
+            cells = (kind, verifier, m.right, m.wrong, f"{m.seconds / own:.2f}")
+            body.append([str(cell) for cell in cells])
+    header = (
+        "matches", "verification", f"pairs of one scene, of {n_right}",
+        f"pairs of two scenes, of {n_wrong}", "time / COLMAP's",
+    )  # fmt: skip
+    return _table(header, body)
 
 
 if __name__ == "__main__":

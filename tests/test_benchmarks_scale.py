@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -62,10 +64,10 @@ def test_tables_hold_every_method_and_size(capsys, tmp_path, monkeypatch):
     for name in (*scale.CALLS, scale.FILTER):
         (row,) = [line for line in times.splitlines() if line.startswith(f"| {name} |")]
         assert float(row.split("|")[2]) > 0
-    (rival,) = [
-        line.split("|") for line in text.splitlines() if line.startswith(f"| {scale.RIVAL} | 1.0 |")
-    ]
-    assert len(rival) == 5
+    for title in (f"## Time / {scale.RIVAL}\n", f"## Time / {scale.RIVAL}, no match right\n"):
+        section = text.split(title)[1].split("##")[0]
+        (rival,) = [line for line in section.splitlines() if line.startswith(f"| {scale.RIVAL} |")]
+        assert rival.split("|")[2:-1] == [" 1.0 ", "  "]
     assert "| density_peaks |" in text.split("## Clustering")[1]
     assert "| two processes | 1.75 |" in text
     assert "| a pair | 0.12 |" in text
@@ -195,13 +197,43 @@ def test_the_page_holds_what_the_mapper_made(tmp_path, monkeypatch, capsys):
         "cv-densityf": sfm.Model(65, 800, 11, 60, np.inf, 0.125, 1.0),
     }
     monkeypatch.setattr(sfm, "compare", lambda *arguments: models)
+    mixtures = {"pycolmap": sfm.Mixture(132, 99, 4.0), "cv-densityf": sfm.Mixture(131, 7, 1.0)}
+    monkeypatch.setattr(sfm, "mix", lambda *arguments: mixtures)
     page = shutil.copy(DOCS / "sfm.md", tmp_path)
-    assert sfm.main(["--scenes", "columns", "--page", page]) == 0
+    assert sfm.main(["--scenes", "table", "city", "columns", "--page", page]) == 0
+    assert "| no ratio test | cv-densityf | 131 | 7 | 0.25 |" in tables(page)
     row = "| columns | ratio 0.8 | cv-densityf | 65 | 800 | 11 | 60 | inf | 0.125 | 0.25 |"
     assert row in tables(page)
     assert row in capsys.readouterr().out
     assert not any(line.startswith("| gallery") for line in tables(page))
     assert any(line.startswith("| `--resume`") for line in tables(page))
+
+
+def test_pairs_of_two_scenes_are_told_by_the_images_names(tmp_path, monkeypatch):
+    """Whatever their numbers in the database."""
+
+    def match_views(views, folder, ratio):
+        assert views == list("abcdefghijkl" * 2)
+        with closing(sqlite3.connect(tmp_path / "matched.db")) as connection:
+            connection.execute("CREATE TABLE images (image_id, name)")
+            connection.execute("CREATE TABLE two_view_geometries (pair_id, rows)")
+            names = [(100 - i, f"{i:02d}.png") for i in range(24)]
+            connection.executemany("INSERT INTO images VALUES (?, ?)", names)
+            connection.commit()
+        return tmp_path / "matched.db"
+
+    def verify(path):
+        pairs = [(0, 11, 20), (12, 13, 15), (3, 14, 16), (11, 12, 0)]
+        geometries = [((100 - j) * (2**31 - 1) + 100 - i, rows) for i, j, rows in pairs]
+        with closing(sqlite3.connect(path)) as connection:
+            connection.executemany("INSERT INTO two_view_geometries VALUES (?, ?)", geometries)
+            connection.commit()
+
+    monkeypatch.setattr(sfm, "render_views", lambda name: list("abcdefghijkl"))
+    monkeypatch.setattr(sfm, "match_views", match_views)
+    monkeypatch.setattr(sfm, "verifiers", lambda seed: {"ours": verify})
+    found = sfm.mix(["table", "city"], 1.0, tmp_path)["ours"]
+    assert (found.right, found.wrong) == (2, 1)
 
 
 class _Pose:
