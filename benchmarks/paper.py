@@ -43,10 +43,9 @@ Bools = NDArray[np.bool_]
 
 #: The paper's number of matches, and the fewest that a real pair must have to stand beside it.
 N_PAPER, N_LEAST = 411, 200
-#: What matches are drawn from, and the SIFT ratio they are below; the paper says neither whether
-#: its matches were mutual neighbours nor whether a ratio test thinned them out.
-ONE_WAY = "one-way matches"
-CUTS: dict[str, float] = {ONE_WAY: np.inf, "all matches": np.inf, "SIFT ratio < 0.8": 0.8}
+#: What is drawn from: the nearest neighbours of the first image's features, those of them that are
+#: mutual, and those of these that pass a ratio test. The paper does not say how it matched.
+ONE_WAY, MUTUAL, DISTINCT = CUTS = ("one-way matches", "mutual matches", "SIFT ratio < 0.8")
 #: The paper names neither.
 CONFIDENCE, MAX_ITERS = 0.999, 5000
 DC_PERCENT = 2.0
@@ -74,7 +73,7 @@ TABLE_3 = {
 SWEEP_ALPHAS = (0.001, 0.002, 0.005, 0.011, 0.02, 0.04, 0.08, 0.16, 0.32)
 SWEEP_THRESHOLD = 1.0
 #: The cut of the sweep and of the pictures.
-SHOWN = "all matches"
+SHOWN = MUTUAL
 #: Width of the pictures, inches: that of a page, so that their letters are as large as its text.
 PAGE = 10
 #: A match this close to F_0, pixels, counts as right.
@@ -84,7 +83,7 @@ PROPOSED, PROPOSED_CV2, DEFAULT = "proposed", "proposed, cv2's RANSAC", "default
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """A pair and, where there are any, its pictures and all its features' nearest neighbours."""
+    """A pair and, where there are any, its pictures and its one-way matches."""
 
     pair: Pair
     source: str
@@ -96,7 +95,7 @@ class Views:
         X, scores = self.pair.X, self.pair.scores
         if cut == ONE_WAY:
             return self.one_way
-        return X if scores is None else X[1 - scores < CUTS[cut]]
+        return X if scores is None or cut == MUTUAL else X[1 - scores < 0.8]
 
 
 @dataclass(frozen=True)

@@ -135,7 +135,11 @@ def scale(
         parts += [
             "## Time, ms\n\n" + _times(calls, numbers),
             f"## Time / {RIVAL}\n\n" + _times(calls, numbers, RIVAL),
-            f"## Time / {RIVAL}, no match right\n\n" + _times(hopeless, few, RIVAL),
+            *(
+                [f"## Time / {RIVAL}, no match right\n\n" + _times(hopeless, few, RIVAL)]
+                if few
+                else []
+            ),
             "## Error, px\n\n" + _errors(calls, numbers),
             *(["## Error / searching all matches\n\n" + _parts_table(parted)] if parted else []),
             "## Error on optical flow, px\n\n" + _errors(dense, list(dense[RIVAL].ms)),

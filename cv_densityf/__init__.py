@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from cv_densityf._coherence import coherence
 from cv_densityf._estimate import Estimate, estimate_fundamental
 from cv_densityf._zhang import epipolar_distance
 from cv_densityf.cv2_api import findFundamentalMat
@@ -52,6 +53,7 @@ __all__ = [
     "FundamentalMatrixEstimator",
     "InputError",
     "Matches",
+    "coherence",
     "density_peaks",
     "epipolar_distance",
     "estimate_fundamental",

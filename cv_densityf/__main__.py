@@ -32,6 +32,7 @@ from cv_densityf._estimate import (
     finite_in_cv2,
 )
 from cv_densityf._files import InputError, read_matches, replacing
+from cv_densityf._prefilter import COHERENT
 from cv_densityf._run_script import add_run, run_script
 from cv_densityf.matching import (
     MAX_FEATURES,
@@ -273,6 +274,13 @@ def _add_verify(commands: argparse._SubParsersAction[Any]) -> None:
         type=_number(int, lambda v: 8 <= v < 2**31, "a whole number from 8"),
         default=15,
         help="a pair with fewer is degenerate (%(default)s, as COLMAP)",
+    )
+    verify.add_argument(
+        "--min-coherence",
+        metavar="SHARE",
+        type=_number(float, lambda v: v <= 1, "a number up to 1"),
+        default=COHERENT,
+        help="so is a pair whose inliers keep fewer of their neighbours (%(default)s)",
     )
     verify.add_argument(
         "--jobs", metavar="N", type=_POSITIVE_INT, default=-1, help="pairs at a time (all cores)"
@@ -689,6 +697,7 @@ def _run_verify(options: argparse.Namespace) -> int:
         method=options.method,
         threshold=options.threshold,
         min_inliers=options.min_inliers,
+        min_coherence=options.min_coherence,
         n_jobs=options.jobs,
         resume=options.resume,
         dry_run=options.dry_run,

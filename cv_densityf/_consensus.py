@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from copy import copy
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -22,6 +22,7 @@ from cv_densityf._epipolar import (
     shift,
 )
 from cv_densityf._parallax import plane_and_parallax
+from cv_densityf._prefilter import COHERENT, coherence
 from cv_densityf._stopwatch import Stopwatch
 
 Floats = NDArray[np.floating]
@@ -41,7 +42,7 @@ ROUNDS = (
     (0.5, BY_SCORE, NEAR),
     (0.25, 1.0),
 )
-#: So many of them where matches lie together only as by chance: such a pair hardly has right ones.
+#: After so many it may be hopeless.
 _ROUNDS_BY_CHANCE = 2
 _NEAR_WIDTH = 8.0
 #: What the draws agree on may be one of several motions: with more than this share of the reliable
@@ -73,7 +74,7 @@ _LOCAL_SIZE = 14
 _LOCAL_WIDTH = 3.0
 _LOCAL_REACH = 20.0
 _LOCAL_STEPS = 2
-#: Number of samples where draws agree.
+#: Number of samples where draws agree, or where it is hopeless.
 _LOCAL_SAMPLES = 16
 #: Where none do, the right F may be next to another hypothesis than the best: number of samples
 #: from each of so many, whose inliers have less than this intersection over union.
@@ -119,8 +120,6 @@ class Consensus:
     votes: tuple[float, ...]
     n_draws: int
     reason: str
-    #: Whether the matches lie together more than by chance.
-    crowded: bool = True
 
 
 def search(
@@ -142,10 +141,9 @@ def search(
     the best hypothesis so far leaves near its epipolar lines: a nearly right F has the right one's
     inliers there. Each hypothesis is polished on all matches. The draws end when a second,
     independent one arrives at the best hypothesis's inliers, and one from what these leave, if that
-    is much, is no better; or after `ROUNDS` on each ranking, sooner where there is little hope.
-    Where most inliers are on a plane, other hypotheses of that plane are then tried. Unless two
-    draws are nearly the same, the best hypothesis is optimised locally; where none agree, others as
-    well.
+    is much, is no better; or after `ROUNDS` on each ranking, or where there is no hope. Where most
+    inliers are on a plane, other hypotheses of that plane are then tried. Unless two draws are
+    nearly the same, the best hypothesis is optimised locally; where none agree, others as well.
 
     Parameters
     ----------
@@ -154,8 +152,9 @@ def search(
     rankings : iterable of (array of shape (n,), bool)
         Reliability of each match: the weight of its vote, in [0, 1], and its place in the order of
         the draws. NaN where it is not known: such a match is in no draw by density and has half a
-        vote. With it, whether the matches lie together more than by chance; if not, there are few
-        rounds. Where no two draws agree the search begins anew with the next ranking.
+        vote. With it, whether the matches lie together more than by chance. If not, and the
+        inliers of the best hypothesis do not either, the search ends after two rounds. Otherwise
+        it begins anew with the next ranking where no two draws agree.
     threshold : float
         Of the draws, pixels. The mask has one of its own, the caller's.
     confidence, max_iters
@@ -185,33 +184,34 @@ def search(
     rng = np.random.default_rng(abs(seed))
     n_draws = 0
     pool: _Pool | None = None
-    for ranking, crowded in rankings:
+    for ranking, together in rankings:
         order = np.argsort(-ranking, kind="stable")[: np.count_nonzero(ranking >= 0.0)]
         reliable = order[: max(MIN_DRAW, len(order) // 2)]
         latest = _Pool(X, np.nan_to_num(ranking, nan=0.5), reliable, threshold, rng, frame)
-        rounds = ROUNDS if crowded else ROUNDS[:_ROUNDS_BY_CHANCE]
-        made, agreed = _fill(
-            latest, X, order, rounds, scores, confidence, max_iters, seed + n_draws, watch
+        made, agreed, hopeless = _fill(
+            latest, X, order, together, scores, confidence, max_iters, seed + n_draws, watch
         )
         n_draws += made
         if len(latest):
-            pool, reliability = latest, ranking
-        if agreed:
+            pool, reliability, in_vain = latest, ranking, hopeless
+        if agreed or hopeless:
             break
     if pool is None:
         return None
     pool.complete()
     if not pool.agrees(_CLOSE_AGREEMENT):
-        pool.optimise(crowded)
+        pool.optimise(in_vain)
         agreed = pool.agrees()
     F = pool.refined_best() if others is None else pool.before(others - centre).settled_best()
     F = shift(-centre[2:]).T @ F @ shift(-centre[:2])
     watch.lap("polish")
     again = ", found again by another" if agreed and pool.agrees_off_plane() else ""
     reason = f"the hypothesis with {pool.virtue} of {n_draws} draws{again}"
-    if not crowded:
-        reason += ", though matches lie together no more than by chance"
-    return Consensus(F, reliability, tuple(pool.votes.tolist()), n_draws, reason, crowded)
+    if in_vain:
+        reason += (
+            ", which ended early: matches lie together only as by chance, and so do the inliers"
+        )
+    return Consensus(F, reliability, tuple(pool.votes.tolist()), n_draws, reason)
 
 
 class _Part(NamedTuple):
@@ -227,17 +227,21 @@ def _fill(
     pool: _Pool,
     X: Floats,
     order: Ints,
-    rounds: Sequence[tuple[float, ...]],
+    together: bool,
     scores: Floats | None,
     confidence: float,
     max_iters: int,
     seed: int,
     watch: Stopwatch,
-) -> tuple[int, bool]:
-    """Make rounds of draws until two of them agree; how many it took, and whether they do."""
+) -> tuple[int, bool, bool]:
+    """Make rounds of draws until two of them agree, or it is hopeless.
+
+    Returns how many draws it took, whether two agree, and whether it is hopeless: the matches do
+    not lie ``together`` more than by chance, and neither do the inliers of the best hypothesis.
+    """
     points = X[order].astype(np.float32)
     n_draws, agreed, asked_rest = 0, False, False
-    for fractions in rounds:
+    for number, fractions in enumerate(ROUNDS, start=1):
         parts = []
         for fraction in fractions:
             by_score = fraction == BY_SCORE
@@ -266,7 +270,9 @@ def _fill(
                 agreed = pool.agrees()
         if agreed:
             break
-    return n_draws, agreed
+        if not together and number == _ROUNDS_BY_CHANCE and not pool.coherent():
+            return n_draws, False, True
+    return n_draws, agreed, False
 
 
 def _draw(pool: _Pool, parts: list[_Part], confidence: float, seed: int, watch: Stopwatch) -> None:
@@ -377,6 +383,10 @@ class _Pool:
         """Mark the matches within ``width`` working thresholds of the best hypothesis."""
         return np.asarray(self._squared[self.best] < (width * self.working) ** 2)
 
+    def coherent(self) -> bool:
+        """Whether the inliers of the best hypothesis stay neighbours, as those of a scene do."""
+        return len(self) > 0 and coherence(self._X[self.near_best(1.0)]) > COHERENT
+
     def complete(self) -> None:
         """Where a plane has most inliers of the best hypothesis, add others of that plane."""
         width = _PLANE_WIDTH * self.working
@@ -391,15 +401,15 @@ class _Pool:
             self._off_plane = off_plane
             self._join(G, np.zeros(len(G)))
 
-    def optimise(self, crowded: bool = True) -> None:
+    def optimise(self, hopeless: bool) -> None:
         """Optimise the best hypothesis locally; if draws do not agree on it, others as well.
 
-        Not so where matches lie together only as by chance: there is hardly a right one.
+        Only the best one where there is hardly a right match.
 
         The inner sampling of Chum, Matas and Kittler, "Locally optimized RANSAC" (2003), with the
         vote as its score.
         """
-        if self.agrees() or not crowded:
+        if self.agrees() or hopeless:
             self._optimise_from(self.best, _LOCAL_SAMPLES)
         else:
             for start in self._finalists(_LOCAL_STARTS_IN_DOUBT, _SAME_BASIN):

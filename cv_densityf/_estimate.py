@@ -77,13 +77,9 @@ class Estimate:
         Milliseconds per stage.
     votes : tuple of float
         The vote for each polished hypothesis of the last search, in the order of the draws; then
-        for those of a dominant plane, and for that of the local optimisation, where there were any.
+        for those of a dominant plane and of the local optimisation, where there were any.
         Of many matches, those of the part that searched. Where a plane is dominant, the winner's
         need not be the largest: the number of inliers off the plane decides.
-    crowded : bool
-        Whether the matches lie together more than by chance, as right ones do. Those of images that
-        have nothing in common mostly do not, however many inliers there are. True where the density
-        was not looked at, too: where cv2's own call answered, and for ``density="paper"``.
 
     See Also
     --------
@@ -99,7 +95,6 @@ class Estimate:
     reason: str
     timings: dict[str, float] = field(default_factory=dict)
     votes: tuple[float, ...] = ()
-    crowded: bool = True
 
     def __bool__(self) -> bool:
         return self.F is not None
@@ -228,7 +223,6 @@ def _estimate(
         reason=found.reason,
         timings=watch.laps,
         votes=found.votes,
-        crowded=found.crowded,
     )
 
 
@@ -247,20 +241,18 @@ def _rankings(
 ) -> Iterator[tuple[NDArray[np.float64], bool]]:
     """Reliability of a part of the better half by score, spread if it is large; then of all.
 
-    With each, whether the matches lie together more than by chance; if not, there is one only.
+    With each, whether the matches lie together more than by chance.
     """
     n = len(X)
     if n > MAX_RANKED:
         better = np.arange(n) if trust is None else best_scored(trust, max(n // 2, MAX_RANKED))
         rows = better[_spread(X[better], MAX_RANKED, np.random.default_rng(abs(seed)))]
-        reliability, _, crowded = contrast_support(X, trust, rows)
+        reliability, _, together = contrast_support(X, trust, rows)
         watch.lap("density")
-        yield reliability, crowded
-        if not crowded:
-            return
-    reliability, _, crowded = contrast_support(X, trust)
+        yield reliability, together
+    reliability, _, together = contrast_support(X, trust)
     watch.lap("density")
-    yield reliability, crowded
+    yield reliability, together
 
 
 def _spread(X: NDArray[np.float64], size: int, rng: np.random.Generator) -> NDArray[np.intp]:
@@ -423,14 +415,8 @@ def estimate_fundamental(
     >>> bool(estimate), estimate.F.shape, estimate.mask.shape
     (True, (3, 3), (500,))
     """
-    first = _points(points1, "points1")
-    second = _points(points2, "points2")
-    if len(first) != len(second):
-        raise ValueError(
-            f"points1 has {len(first)} points and points2 {len(second)}; "
-            "row i of both must be one match"
-        )
-    trust = None if scores is None else check_scores(scores, len(first))
+    X = check_matches(points1, points2)
+    trust = None if scores is None else check_scores(scores, len(X))
     _check(
         "threshold", threshold, Real, lambda v: 1e-12 < v < 1e6, "a number above 1e-12, below 1e6"
     )
@@ -442,7 +428,7 @@ def estimate_fundamental(
     in_range = "an integer from 0 to 2^31 - 1"
     _check("random_state", random_state, Integral, lambda v: 0 <= v < 2**31, in_range)
     return run(
-        np.hstack([first, second]),
+        X,
         Robust(method_flag(method), float(threshold), float(confidence), int(max_iters)),
         density=density,
         alpha=alpha,
@@ -457,6 +443,18 @@ def check_density(density: Any, alpha: Any, dc_percent: Any) -> None:
     _check("density", density, str, DENSITIES.__contains__, f"one of {', '.join(DENSITIES)}")
     _check("alpha", alpha, Real, lambda v: 0 <= v <= 1, "a number from 0 to 1")
     _check("dc_percent", dc_percent, Real, lambda v: 0 < v <= 100, "a number in (0, 100]")
+
+
+def check_matches(points1: ArrayLike, points2: ArrayLike) -> NDArray[np.float64]:
+    """Return matched points as rows x, y, x', y', (n, 4), or raise ValueError."""
+    first = _points(points1, "points1")
+    second = _points(points2, "points2")
+    if len(first) != len(second):
+        raise ValueError(
+            f"points1 has {len(first)} points and points2 {len(second)}; "
+            "row i of both must be one match"
+        )
+    return np.hstack([first, second])
 
 
 def check_scores(scores: ArrayLike, n: int | None) -> NDArray[np.float64]:

@@ -19,11 +19,14 @@ _KD_TREE: dict[str, bool | int | float | str] = {"algorithm": 4}
 _EXACT: dict[str, bool | int | float | str] = {"checks": -1}
 #: Squared distances beyond would not fit in float32.
 _FARTHEST = 1e18
-#: Matches lie together more than by chance if their mean contrast exceeds its expectation by this
-#: much, a thirtieth of what it is where all are right, or by so many standard deviations. Between
-#: photographs of two scenes texture alone makes half of that.
+#: Matches lie together more than by chance if their mean contrast exceeds its expectation by the
+#: first, or by so many of its standard deviations, which is less from some 200 matches on. Texture
+#: alone makes half of the first between photographs of two scenes.
 _EXCESS = 0.1
 _SIGNIFICANT = 6.0
+#: From here on `coherence` tells inliers of a common scene: they have .4 and more, those that wrong
+#: matches happen to make hardly ever .35.
+COHERENT = 0.35
 #: Of the caller's scores the worst part, one match in so many, is no witness for others.
 _WORST = 5
 #: Rows compared at a time, so that the comparison table stays in the cache.
@@ -97,25 +100,44 @@ def density_contrast(
 def beyond_chance(contrast: Floats, n: int, n_among: int) -> bool:
     """Whether n matches lie together more than those of two images without a common scene.
 
-    Were the matches paired at random, with neighbourhoods of k among l of them, the a-th neighbour
-    in one image would be the b-th in the other with probability 1 / (l - 1), and add 1 / max(a, b)
-    to the contrast. Since neighbours mostly come in twos, each other's, the mean over n matches
-    then has up to twice the variance of independent ones.
-
     Parameters
     ----------
     contrast : array, shape (m,)
-        `density_contrast` of the n matches, or of a part of them that stands for all.
+        `density_contrast` of the n matches, or of m of them that stand for all.
     n : int
         Number of matches.
     n_among : int
         Number of those that count as neighbours.
     """
-    rank = np.arange(1, min(N_NEIGHBORS, n_among - 1) + 1)
-    pairs = (2 * rank - 1) / (n_among - 1)
-    deviation = np.sqrt(2 * (pairs / rank**2).sum() / n)
-    excess = contrast.mean() - (pairs / rank).sum()
-    return bool(excess > min(_EXCESS, _SIGNIFICANT * deviation))
+    rank, expected = _by_chance(n_among)
+    excess = contrast.mean() - (expected / rank).sum()
+    part = len(contrast) / n
+    # Neighbourhood is mostly mutual, so two matches gain together where both are looked at.
+    variance = (1 + part) * (expected / rank**2).sum() / len(contrast)
+    # A part tells less: in doubt it does not say that there is nothing.
+    return bool(excess > min(_EXCESS, _SIGNIFICANT * part * np.sqrt(variance)))
+
+
+def coherence(X: Floats) -> float:
+    """Mean contrast of matches (n, 4), on a scale from 0 by chance to 1 for the most there can be.
+
+    NaN for fewer than three.
+    """
+    if len(X) < 3:
+        return np.nan
+    rank, expected = _by_chance(len(X))
+    mean, most = (expected / rank).sum(), (1 / rank).sum()
+    return float((density_contrast(X).mean() - mean) / (most - mean))
+
+
+def _by_chance(n: int) -> tuple[Ints, NDArray[np.float64]]:
+    """Ranks 1, 2, ..., and the shared neighbours of each if n matches are paired at random.
+
+    The a-th neighbour in one image is the b-th in the other with probability 1 / (n - 1), and has
+    the rank max(a, b).
+    """
+    rank = np.arange(1, min(N_NEIGHBORS, n - 1) + 1)
+    return rank, (2 * rank - 1) / (n - 1)
 
 
 def ranks(values: Floats) -> NDArray[np.float64]:
@@ -137,17 +159,15 @@ def best_scored(scores: Floats, size: int) -> Ints:
 
 
 class Support(NamedTuple):
-    """What `contrast_support` says."""
+    """Reliability of each match, the denser half, and whether all lie together beyond chance."""
 
     reliability: NDArray[np.float64]
     kept: Bools
-    crowded: bool
+    beyond_chance: bool
 
 
 def contrast_support(X: Floats, scores: Floats | None = None, rows: Ints | None = None) -> Support:
-    """Rank in [0, 1] of each match's density contrast, 1 for the most reliable; the denser half.
-
-    And whether the matches lie together more than by chance, see `beyond_chance`.
+    """Rank in [0, 1] of each match's density contrast, 1 for the most reliable; see `Support`.
 
     With ``scores`` (n,), higher for more trusted matches, both count: see `with_scores`; and the
     worst fifth by score does not count as neighbours. With ``rows`` (m,) only these are looked at,
@@ -158,13 +178,13 @@ def contrast_support(X: Floats, scores: Floats | None = None, rows: Ints | None 
         rows = np.arange(n)
     among = None if scores is None else best_scored(scores, n - n // _WORST)
     contrast = density_contrast(X, rows=rows, among=among)
-    crowded = beyond_chance(contrast, n, n if among is None else len(among))
+    together = beyond_chance(contrast, n, n if among is None else len(among))
     ranked = ranks(contrast)
     if scores is not None:
         ranked = with_scores(ranked, scores[rows])
     reliability = np.full(n, np.nan)
     reliability[rows] = ranked
-    return Support(reliability, reliability >= 0.5, crowded)
+    return Support(reliability, reliability >= 0.5, together)
 
 
 def paper_support(X: Floats, alpha: float, dc_percent: float) -> tuple[NDArray[np.float64], Bools]:

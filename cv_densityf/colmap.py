@@ -19,8 +19,10 @@ from urllib.request import pathname2url
 import numpy as np
 from numpy.typing import NDArray
 
+from cv_densityf._coherence import coherence
 from cv_densityf._estimate import Estimate
 from cv_densityf._files import InputError
+from cv_densityf._prefilter import COHERENT
 from cv_densityf.batch import estimate_many, progress_bar
 
 #: COLMAP's names for what two views can be.
@@ -48,8 +50,7 @@ class Verification:
     n_before : int
         Of these, pairs that were verified before and left alone (``resume``).
     n_verified : int
-        Pairs now found to overlap: with a fundamental matrix, enough inliers, and matches that lie
-        together more than by chance.
+        Pairs now found to overlap: with a fundamental matrix and enough, coherent inliers.
     n_matches, n_inliers : int
         Matches looked at now, and inliers among them.
     failures : tuple of (int, int, str)
@@ -70,6 +71,7 @@ def verify_matches(
     method: str = "usac_accurate",
     threshold: float = 4.0,
     min_inliers: int = 15,
+    min_coherence: float = COHERENT,
     n_jobs: int | None = None,
     resume: bool = False,
     dry_run: bool = False,
@@ -89,8 +91,10 @@ def verify_matches(
         Largest residual of an inlier, pixels. COLMAP's default is 4.
     min_inliers : int
         A pair with fewer is written as degenerate, without inliers; at least 8. COLMAP's default
-        is 15. So is a pair whose matches lie together only as by chance, unless most are inliers:
-        of some hundred wrong matches, 15 are soon within 4 pixels.
+        is 15.
+    min_coherence : float
+        Likewise a pair whose inliers have less of `coherence`, at most 1: wrong matches, of which
+        some are always within 4 pixels of their lines.
     n_jobs : int, optional
         Pairs at a time, as in `estimate_many`; -1 for one per core.
     resume : bool
@@ -132,6 +136,8 @@ def verify_matches(
     """
     if min_inliers < 8:
         raise ValueError(f"min_inliers is {min_inliers}; it must be at least 8")
+    if not min_coherence <= 1:
+        raise ValueError(f"min_coherence is {min_coherence}; it must be a number up to 1")
     path = Path(database)
     with _open(path, write=not dry_run) as connection:
         n_pairs = _check(connection)
@@ -158,13 +164,18 @@ def verify_matches(
                     **options,
                 )
                 rows = []
-                for pair_id, (matches, _), estimate in zip(part, pairs, estimates, strict=True):
+                for pair_id, (matches, points), estimate in zip(
+                    part, pairs, estimates, strict=True
+                ):
                     update()
                     n_matches += len(matches)
                     if estimate.engine == "none":
                         failures.append((*_image_ids(pair_id), estimate.reason))
                         continue
-                    row = _row(pair_id, matches, estimate, min_inliers)
+                    held = estimate.n_inliers >= min_inliers and (
+                        coherence(*points, estimate.mask) >= min_coherence
+                    )
+                    row = _row(pair_id, matches, estimate, held)
                     verified += row[-2] == UNCALIBRATED
                     n_inliers += row[1]
                     rows.append(row)
@@ -270,12 +281,11 @@ def _image_ids(pair_id: int) -> tuple[int, int]:
 
 
 def _row(
-    pair_id: int, matches: Indices, estimate: Estimate, min_inliers: int
+    pair_id: int, matches: Indices, estimate: Estimate, held: bool
 ) -> tuple[int, int, bytes | None, int, bytes | None]:
     """Give pair_id, rows, data, config and F as the table of two-view geometries has them."""
     F = estimate.F
-    enough = min_inliers if estimate.crowded else max(min_inliers, len(matches) / 2)
-    if F is None or F.shape != (3, 3) or estimate.n_inliers < enough:
+    if F is None or F.shape != (3, 3) or not held:
         return pair_id, 0, None, DEGENERATE, None
     inliers = np.ascontiguousarray(matches[estimate.mask])
     return pair_id, len(inliers), inliers.tobytes(), UNCALIBRATED, F.astype(np.float64).tobytes()

@@ -465,8 +465,8 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         Largest distance of an inlier, in pixels: ``threshold``, or what "lmeds" derived from the
         rows of fit.
     reason_ : str
-        One sentence on how F_ came about: whether draws agree, and whether the matches lie together
-        more than by chance; or that cv2's own call made it.
+        How F_ came about, in a few words: the ``reason`` of an `Estimate`, or that cv2's own call
+        made it.
     n_features_in_ : int
         Always 4.
     feature_names_in_ : ndarray of str, shape (4,)
@@ -588,7 +588,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
                 answer = self.prefilter_.fit_predict(matches, **prefilter_params)
                 candidates = _enough(_as_mask(answer, len(matches)))
             F, candidates = _plain_estimate(matches, candidates, robust)
-            reason = "cv2's own call"
+            reason = "cv2's own call" if F is not None else "cv2 found none"
         if F is None or not np.isfinite(F).all():
             raise ValueError(
                 f"no fundamental matrix was found from {len(matches)} matches ({reason}); try a "

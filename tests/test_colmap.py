@@ -192,11 +192,15 @@ def test_empty_and_few_matches_are_degenerate(tmp_path, capsys):
     assert [row[4] for row in rows(path)] == [DEGENERATE] * 2
 
 
-def test_inliers_by_chance_do_not_verify_a_pair(database, made):
+def test_incoherent_inliers_do_not_verify_a_pair(database, made):
     _, points1, points2 = list(made[1].values())[2]  # the junk
-    assert 15 <= estimate_fundamental(points1, points2, threshold=4.0).n_inliers < 150
+    assert estimate_fundamental(points1, points2, threshold=4.0).n_inliers >= 15
     assert verify_matches(database).n_verified == 3
     assert rows(database)[2][4] == DEGENERATE
+    assert verify_matches(database, min_coherence=-1.0).n_verified == 4
+    assert main(["verify", str(database), "--min-coherence", "1"]) == 1
+    with pytest.raises(ValueError, match="min_coherence is nan"):
+        verify_matches(database, min_coherence=np.nan)
 
 
 def refused(path, capsys, *options):

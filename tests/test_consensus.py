@@ -33,10 +33,10 @@ SEEDS = range(4)
 ASKED = {"threshold": 1.0, "confidence": 0.999, "max_iters": 5000}
 
 
-def find(X, reliability=None, *, crowded=True, seed=0, **asked):
+def find(X, reliability=None, *, together=True, seed=0, **asked):
     if reliability is None:
         reliability = contrast_support(X)[0]
-    return search(X, [(reliability, crowded)], seed=seed, watch=Stopwatch(), **{**ASKED, **asked})
+    return search(X, [(reliability, together)], seed=seed, watch=Stopwatch(), **{**ASKED, **asked})
 
 
 def true_matches(seed, n=400):
@@ -221,27 +221,31 @@ def test_local_optimisation_finds_more_votes_near_a_poor_hypothesis(seed):
     before = pool.votes.max()
     for _ in range(5):
         most = pool.votes.max()
-        pool.optimise()
+        pool.optimise(False)
         assert pool.votes.max() >= most
     assert pool.votes.max() > before
     assert not pool.agrees()
 
 
 @pytest.mark.parametrize(
-    ("sizes", "crowded", "samples"),
-    [((60, 150), True, [16]), ((60, 60), True, [64, 64]), ((60, 60), False, [16])],
+    ("sizes", "hopeless", "starts"),
+    [
+        ((60, 150), False, [(0, 16)]),
+        ((60, 60), False, [(0, 64), (2, 64), (3, 64)]),
+        ((60, 60), True, [(0, 16)]),
+    ],
 )
-def test_rivals_are_optimised_only_where_no_draws_agree(monkeypatch, sizes, crowded, samples):
-    X = np.vstack([true_matches(0, n=250), true_matches(50, n=150)])
-    X -= X.mean(axis=0)
-    larger, smaller = eight_point(X[None, :250]), eight_point(X[None, 250:])
-    pool = _Pool(X, np.ones(400), np.arange(400), 1.0, np.random.default_rng(0))
-    pool.add(np.concatenate([larger, larger, smaller]), [*sizes, 100])
-    starts = []
-    monkeypatch.setattr(_Pool, "_optimise_from", lambda pool, *start: starts.append(start))
-    pool.optimise(crowded)
-    assert [n_samples for _, n_samples in starts] == samples
-    assert [start for start, _ in starts] == [pool.best, 2][: len(samples)]
+def test_rivals_are_optimised_only_where_no_draws_agree(monkeypatch, sizes, hopeless, starts):
+    sizes_of = zip((0, 50, 100, 150), (250, 150, 99, 60), strict=True)
+    motions = [true_matches(seed, n=n) for seed, n in sizes_of]
+    X = np.vstack(motions)
+    F = np.concatenate([eight_point(motion[None]) for motion in motions])
+    pool = _Pool(X, np.ones(len(X)), np.arange(len(X)), 1.0, np.random.default_rng(0))
+    pool.add(F[[0, 0, 1, 2, 3]], [*sizes, 100, 100, 100])
+    made = []
+    monkeypatch.setattr(_Pool, "_optimise_from", lambda pool, *start: made.append(start))
+    pool.optimise(hopeless)
+    assert made == starts
 
 
 @pytest.mark.parametrize("seed", [0, 2, 7])
@@ -253,7 +257,7 @@ def test_in_doubt_another_hypothesis_than_the_best_is_optimised_as_well(seed):
     pool = _Pool(X, np.ones(400), np.arange(400), 1.0, np.random.default_rng(seed))
     pool.add(np.concatenate([eight_point(X[None, 250:]), eight_point(X[None, :8])]), [150, 8])
     assert pool.best == 0
-    pool.optimise()
+    pool.optimise(False)
     assert pool.near_best(2.0)[:250].all()
 
 
@@ -294,18 +298,30 @@ def test_two_different_answers_are_no_agreement(monkeypatch):
     assert "chance" not in found.reason
 
 
-def test_matches_that_lie_together_only_as_by_chance_get_few_rounds(monkeypatch):
-    scene = scene_of(0)
-    draws = spied_draws(monkeypatch, lambda *_, **__: None)
-    assert find(scene.X, crowded=False) is None
-    made = len(draws)
-    assert find(scene.X) is None
-    assert 2 <= made < 0.6 * (len(draws) - made)
-    monkeypatch.undo()
-    assert "chance" not in find(scene.X).reason
-    assert find(scene.X, crowded=False).reason.endswith(
-        ", though matches lie together no more than by chance"
-    )
+def test_where_all_lies_together_only_as_by_chance_the_search_ends_early(monkeypatch):
+    wrong = scene_of(0).X
+    wrong[:, 2:] = np.random.default_rng(0).permutation(wrong[:, 2:])
+    draws = spied_draws(monkeypatch, _engine.draw)
+    optimised = []
+    monkeypatch.setattr(_Pool, "optimise", lambda pool, hopeless: optimised.append(hopeless))
+    found = find(wrong, together=False)
+    assert found.n_draws == len(draws) == 4
+    assert found.reason.endswith("lie together only as by chance, and so do the inliers")
+    assert optimised == [True]
+    # Not where one of both does: the matches,
+    assert find(wrong).n_draws > 4
+    # or the inliers of a hypothesis on which no two draws agree.
+    monkeypatch.setattr(_Pool, "agrees", lambda *_: False)
+    assert find(scene_of(0).X, together=False).n_draws > 4
+    assert optimised == [True, False, False]
+
+
+def test_another_ranking_is_not_asked_for_where_it_is_hopeless():
+    wrong = scene_of(0).X
+    wrong[:, 2:] = np.random.default_rng(0).permutation(wrong[:, 2:])
+    rankings = iter([(contrast_support(wrong)[0], False), None])
+    search(wrong, rankings, seed=0, watch=Stopwatch(), **ASKED)
+    assert next(rankings) is None
 
 
 def test_more_than_the_reliable_part_counts():
@@ -585,7 +601,7 @@ def test_local_optimisation_is_no_second_opinion():
     pool = _Pool(X, np.ones(600), np.arange(600), 1.0, np.random.default_rng(0))
     pool.add(eight_point(X[None, scene.inliers]), [50])
     for _ in range(3):
-        pool.optimise()
+        pool.optimise(False)
     assert len(pool) == 4
     assert not pool.agrees()
 
@@ -595,7 +611,7 @@ def test_local_optimisation_takes_half_of_the_near_matches_and_no_fewer_than_eig
     X = true_matches(0, n=n)
     pool = _Pool(X - X.mean(axis=0), np.ones(n), np.arange(n), 1.0, np.random.default_rng(0))
     pool.add(eight_point(pool._X[None]), [n])
-    pool.optimise()
+    pool.optimise(False)
     assert len(pool) == 1 + n_fits
 
 

@@ -723,13 +723,19 @@ def test_a_pair_without_a_common_scene_gets_few_draws(n):
     wrong = np.random.default_rng(0).permutation(scene.points2)
     estimate = estimate_fundamental(scene.points1, wrong)
     assert "by chance" in estimate.reason
-    assert not estimate.crowded
     assert estimate.n_draws <= 5
     assert np.isnan(estimate.reliability).sum() == max(n - 1000, 0)
-    right = estimate_fundamental(scene.points1, scene.points2)
-    assert "by chance" not in right.reason
-    assert right.crowded
-    assert estimate_fundamental(scene.points1, wrong, density="off").crowded
+    assert "by chance" not in estimate_fundamental(scene.points1, scene.points2).reason
+
+
+def test_few_right_matches_among_many_are_not_given_up():
+    """One in twenty of 3,000, which are hardly denser than chance: most scenes are solved."""
+    solved = 0
+    for seed in range(6):
+        scene = two_view_scene(3000, inlier_ratio=0.05, noise=0.5, random_state=seed)
+        estimate = estimate_fundamental(scene.points1, scene.points2)
+        solved += scene.inliers[estimate.mask].mean() > 0.5
+    assert solved >= 5
 
 
 def test_copies_of_a_match_do_not_end_the_search():

@@ -13,6 +13,7 @@ from cv_densityf import _prefilter
 from cv_densityf._prefilter import (
     N_NEIGHBORS,
     best_scored,
+    beyond_chance,
     contrast_support,
     density_contrast,
     paper_support,
@@ -100,28 +101,44 @@ def paired_at_random(seed, n):
     return np.hstack([X[:, :2], np.random.default_rng(seed).permutation(X[:, 2:])])
 
 
-@pytest.mark.parametrize("n", [40, 300])
-def test_what_chance_makes_of_the_contrast_is_known(n, monkeypatch):
-    """Random pairings exceed their expectation half of the time, by three deviations never."""
-    pairings = [paired_at_random(seed, n) for seed in range(60)]
+@pytest.mark.parametrize(("n", "part"), [(40, 1), (300, 1), (1200, 3)])
+def test_what_chance_makes_of_the_contrast_is_known(n, part, monkeypatch):
+    """Its mean over a third of the matches, or all, and how far that strays."""
     monkeypatch.setattr(_prefilter, "_EXCESS", np.inf)
-    for deviations, least, most in ((0, 0.3, 0.7), (3, 0.0, 0.0)):
-        monkeypatch.setattr(_prefilter, "_SIGNIFICANT", deviations)
-        assert least <= np.mean([contrast_support(X).crowded for X in pairings]) <= most
+    beyond = {}
+    pairings = [density_contrast(paired_at_random(seed, n))[::part] for seed in range(80)]
+    for deviations in (-0.7, 0, 0.7, 3):
+        monkeypatch.setattr(_prefilter, "_SIGNIFICANT", deviations * part)
+        beyond[deviations] = np.mean([beyond_chance(c, n, n) for c in pairings])
+    assert 0.3 < beyond[0] < 0.7
+    # A quarter each, if the deviation is the true one; it may be a little too large.
+    assert 0.08 < 1 - beyond[-0.7] < 0.4
+    assert 0.08 < beyond[0.7] < 0.4
+    assert beyond[3] < 0.03
+
+
+def test_chance_by_hand():
+    """Of sixteen matches each has the other fifteen for neighbours, in either image."""
+    mean = sum(1 / max(a, b) for a in range(1, 16) for b in range(1, 16)) / 15
+    for more, beyond in ((0.101, True), (0.099, False)):
+        assert beyond_chance(np.full(16, mean + more), 16, 16) == beyond
+
+
+@pytest.mark.parametrize(("n", "limit"), [(100, 0.1), (1000, 6 * 3.2 / 1000)])
+def test_the_excess_that_counts_is_a_tenth_or_six_deviations_if_that_is_less(n, limit):
+    mean = sum(1 / max(a, b) for a in range(1, 17) for b in range(1, 17)) / (n - 1)
+    for factor, beyond in ((1.03, True), (0.97, False)):
+        assert beyond_chance(np.full(n, mean + factor * limit), n, n) == beyond
+    assert beyond_chance(np.full(n // 10, mean + 0.7 * limit), n, n)
 
 
 @pytest.mark.parametrize("n", [60, 300, 1500])
 @pytest.mark.parametrize("scored", [False, True])
 def test_right_matches_lie_together_more_than_by_chance(n, scored):
-    rng = np.random.default_rng(n)
-    some = rng.permutation(n)[: n // 2]
-    scores = rng.uniform(size=n) if scored else None
-    for rows in (None, some):
-        together = [contrast_support(scene_of(seed, n).X, scores, rows).crowded for seed in SEEDS]
-        by_chance = [
-            contrast_support(paired_at_random(seed, n), scores, rows).crowded for seed in SEEDS
-        ]
-        assert (all(together), any(by_chance)) == (True, False)
+    scores = np.random.default_rng(n).uniform(size=n) if scored else None
+    for seed in SEEDS:
+        assert contrast_support(scene_of(seed, n).X, scores).beyond_chance
+        assert not contrast_support(paired_at_random(seed, n), scores).beyond_chance
 
 
 @pytest.mark.parametrize("n", [3, 40, 300])
