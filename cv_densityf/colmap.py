@@ -94,7 +94,7 @@ def verify_matches(
         is 15.
     min_coherence : float
         Likewise a pair whose inliers have less of `coherence`, at most 1: wrong matches, of which
-        some are always within 4 pixels of their lines.
+        some are always within 4 pixels of their lines. Not asked for where most are inliers.
     n_jobs : int, optional
         Pairs at a time, as in `estimate_many`; -1 for one per core.
     resume : bool
@@ -172,8 +172,9 @@ def verify_matches(
                     if estimate.engine == "none":
                         failures.append((*_image_ids(pair_id), estimate.reason))
                         continue
-                    held = estimate.n_inliers >= min_inliers and (
-                        coherence(*points, estimate.mask) >= min_coherence
+                    n = estimate.n_inliers
+                    held = n >= min_inliers and (
+                        2 * n > len(matches) or coherence(*points, estimate.mask) >= min_coherence
                     )
                     row = _row(pair_id, matches, estimate, held)
                     verified += row[-2] == UNCALIBRATED

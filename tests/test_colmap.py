@@ -198,7 +198,9 @@ def test_incoherent_inliers_do_not_verify_a_pair(database, made):
     assert verify_matches(database).n_verified == 3
     assert rows(database)[2][4] == DEGENERATE
     assert verify_matches(database, min_coherence=-1.0).n_verified == 4
-    assert main(["verify", str(database), "--min-coherence", "1"]) == 1
+    # Where most matches are inliers nobody asks.
+    assert main(["verify", str(database), "--min-coherence", "1"]) == 0
+    assert verify_matches(database, min_coherence=1.0).n_verified == 3
     with pytest.raises(ValueError, match="min_coherence is nan"):
         verify_matches(database, min_coherence=np.nan)
 
