@@ -465,8 +465,8 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         Largest distance of an inlier, in pixels: ``threshold``, or what "lmeds" derived from the
         rows of fit.
     reason_ : str
-        How ``F_`` came about, in a few words: the ``reason`` of an `Estimate`, or that cv2's own call
-        made it.
+        How ``F_`` came about, in a few words: the ``reason`` of an `Estimate`, or that cv2's own
+        call made it.
     n_features_in_ : int
         Always 4.
     feature_names_in_ : ndarray of str, shape (4,)
