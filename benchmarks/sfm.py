@@ -13,7 +13,7 @@ import sqlite3
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -86,17 +86,10 @@ def compare(name: str, ratio: float, folder: Path, seed: int = 0) -> dict[str, M
     matched = match_views(views, folder, ratio)
     # Starts the worker processes, which a long run does not notice.
     verify_matches(matched, n_jobs=-1, dry_run=True)
-    models = {}
-    for verifier, verify in verifiers(seed).items():
-        database = folder / f"{verifier}.db"
-        shutil.copy(matched, database)
-        start = time.perf_counter()
-        verify(database)
-        seconds = time.perf_counter() - start
-        models[verifier] = map_images(
-            database, folder / "images", folder / verifier, views, seconds, seed
-        )
-    return models
+    return {
+        verifier: map_images(database, folder / "images", folder / verifier, views, seconds, seed)
+        for verifier, database, seconds in verified(matched, folder, seed)
+    }
 
 
 def mix(names: Sequence[str], ratio: float, folder: Path, seed: int = 0) -> dict[str, Mixture]:
@@ -104,12 +97,7 @@ def mix(names: Sequence[str], ratio: float, folder: Path, seed: int = 0) -> dict
     views = [view for name in names for view in render_views(name)]
     matched = match_views(views, folder, ratio)
     found = {}
-    for verifier, verify in verifiers(seed).items():
-        database = folder / f"{verifier}.db"
-        shutil.copy(matched, database)
-        start = time.perf_counter()
-        verify(database)
-        seconds = time.perf_counter() - start
+    for verifier, database, seconds in verified(matched, folder, seed):
         with contextlib.closing(sqlite3.connect(database)) as connection:
             name_of = dict(connection.execute("SELECT image_id, name FROM images"))
             pairs = connection.execute("SELECT pair_id FROM two_view_geometries WHERE rows > 0")
@@ -120,6 +108,16 @@ def mix(names: Sequence[str], ratio: float, folder: Path, seed: int = 0) -> dict
         right = sum(len(scene) == 1 for scene in scenes)
         found[verifier] = Mixture(right, len(scenes) - right, seconds)
     return found
+
+
+def verified(matched: Path, folder: Path, seed: int) -> Iterator[tuple[str, Path, float]]:
+    """Verify copies of a database in every way; name, copy, and seconds by the clock."""
+    for verifier, verify in verifiers(seed).items():
+        database = folder / f"{verifier}.db"
+        shutil.copy(matched, database)
+        start = time.perf_counter()
+        verify(database)
+        yield verifier, database, time.perf_counter() - start
 
 
 def verifiers(seed: int) -> dict[str, Callable[[Path], object]]:
