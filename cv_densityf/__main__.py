@@ -462,6 +462,7 @@ def _report(
         "n_matches": len(X),
         "n_kept": int(estimate.kept.sum()),
         "n_inliers": estimate.n_inliers,
+        "coherence": _coherence(X[estimate.mask]),
         "median_residual": _median_residual(estimate.F, X[estimate.mask], robust),
         "engine": estimate.engine,
         "n_draws": estimate.n_draws,
@@ -481,6 +482,7 @@ def _plain_report(X: Floats, robust: Robust, F: Floats | None, mask: Any) -> dic
     return {
         "F": _usable(F),
         "n_inliers": int(inliers.sum()),
+        "coherence": _coherence(X[inliers]),
         "median_residual": _median_residual(F, X[inliers], robust),
     }
 
@@ -488,6 +490,11 @@ def _plain_report(X: Floats, robust: Robust, F: Floats | None, mask: Any) -> dic
 def _usable(F: Floats | None) -> list[list[float]] | None:
     """Rows of ``F``; None as well where cv2 answers with a matrix of NaN."""
     return None if F is None or not np.isfinite(F).all() else F.tolist()
+
+
+def _coherence(X: Floats) -> float | None:
+    value = cv_densityf.coherence(X[:, :2], X[:, 2:])
+    return None if np.isnan(value) else value
 
 
 def _median_residual(F: Floats | None, X: Floats, robust: Robust) -> float | None:
@@ -501,7 +508,8 @@ def _median_residual(F: Floats | None, X: Floats, robust: Robust) -> float | Non
 def _for_people(report: dict[str, Any]) -> str:
     times = report["timings_ms"]
     ours = [report["n_kept"], *_result(report), f"{times['estimating']:.1f}"]
-    names = ["kept as dense", "inliers", "median residual, px", "processor time, ms"]
+    names = ["kept as dense", "inliers", "their coherence", "median residual, px"]
+    names.append("processor time, ms")
     lines = [
         f"{report['n_matches']} matches, {report['method']}, threshold {report['threshold']:g} px",
         "",
@@ -510,7 +518,7 @@ def _for_people(report: dict[str, Any]) -> str:
         lines.append(f"{'':<22}{'plain cv2':>12}")
         lines += [f"{name:<22}{a:>12}" for name, a in zip(names[1:], ours[1:], strict=True)]
     else:
-        plain = ["-", "not run", "-", "-"]
+        plain = ["-", "not run", "-", "-", "-"]
         if report["cv2"] is not None:
             plain = ["-", *_result(report["cv2"]), f"{times['plain cv2']:.1f}"]
         lines.append(f"{'':<22}{'cv-densityf':>12}{'plain cv2':>12}")
@@ -531,11 +539,15 @@ def _for_people(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _result(side: dict[str, Any]) -> tuple[str, str]:
+def _result(side: dict[str, Any]) -> tuple[str, str, str]:
     if side["F"] is None:
-        return "no F", "-"
-    residual = side["median_residual"]
-    return str(side["n_inliers"]), "-" if residual is None else f"{residual:.3f}"
+        return "no F", "-", "-"
+    coherence, residual = side["coherence"], side["median_residual"]
+    return (
+        str(side["n_inliers"]),
+        "-" if coherence is None else f"{coherence:.2f}",
+        "-" if residual is None else f"{residual:.3f}",
+    )
 
 
 def _write(

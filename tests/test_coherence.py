@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cv_densityf import coherence, estimate_fundamental
+from cv_densityf import _prefilter, coherence, estimate_fundamental
 from cv_densityf.datasets import two_view_scene
 
 SEEDS = range(6)
@@ -41,6 +41,15 @@ def test_it_is_0_by_chance_and_1_where_nothing_moves():
     chance = [coherence(points, rng.permutation(points)) for _ in range(30)]
     assert abs(np.mean(chance)) < 0.01
     assert np.std(chance) < 0.02
+
+
+def test_of_very_many_it_is_that_of_some_among_all(monkeypatch):
+    X = two_view_scene(500, inlier_ratio=0.7, random_state=0).X
+    whole = coherence(X[:, :2], X[:, 2:])
+    monkeypatch.setattr(_prefilter, "_COHERENCE_OF", 100)
+    some = coherence(X[:, :2], X[:, 2:])
+    assert some != whole
+    assert some == pytest.approx(whole, abs=0.1)
 
 
 @pytest.mark.parametrize("threshold", [1.0, 4.0])

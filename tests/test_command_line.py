@@ -14,6 +14,7 @@ import pytest
 
 import cv_densityf
 from cv_densityf.__main__ import main
+from cv_densityf._coherence import coherence
 from cv_densityf._epipolar import inlier_mask, residuals, sampson_distance
 from cv_densityf._estimate import estimate_fundamental
 from cv_densityf.datasets import motorcycle, two_view_scene
@@ -87,6 +88,7 @@ def test_points_to_json(run, npz):
     mask = inlier_mask(F, SCENE.X, "usac", 1.0)
     assert report["n_matches"] == 400
     assert report["n_inliers"] == mask.sum()
+    assert report["coherence"] == coherence(SCENE.points1, SCENE.points2, mask)
     assert report["median_residual"] == pytest.approx(
         np.median(residuals(F, SCENE.X[mask], "usac"))
     )
@@ -98,6 +100,7 @@ def test_plain_cv2_stands_beside_it(run, npz):
     plain = json.loads(out)["cv2"]
     np.testing.assert_array_equal(plain["F"], F)
     assert plain["n_inliers"] == mask.sum()
+    assert plain["coherence"] == coherence(SCENE.points1, SCENE.points2, mask)
     expected = np.median(residuals(F, SCENE.X[mask.ravel() > 0], "ransac"))
     assert plain["median_residual"] == pytest.approx(expected)
 
@@ -150,6 +153,7 @@ def test_people_read_the_same_numbers(run, npz):
     for line, ours, plain in (
         ("kept as dense", report["n_kept"], "-"),
         ("inliers", report["n_inliers"], report["cv2"]["n_inliers"]),
+        ("their coherence", f"{report['coherence']:.2f}", f"{report['cv2']['coherence']:.2f}"),
         (
             "median residual, px",
             f"{report['median_residual']:.3f}",
