@@ -45,7 +45,8 @@ Bools = NDArray[np.bool_]
 N_PAPER, N_LEAST = 411, 200
 #: What is drawn from: the nearest neighbours of the first image's features, those of them that are
 #: mutual, and those of these that pass a ratio test. The paper does not say how it matched.
-ONE_WAY, MUTUAL, DISTINCT = CUTS = ("one-way matches", "mutual matches", "SIFT ratio < 0.8")
+ONE_WAY, MUTUAL, RATIO = "one-way matches", "mutual matches", 0.8
+CUTS = (ONE_WAY, MUTUAL, f"SIFT ratio < {RATIO}")
 #: The paper names neither.
 CONFIDENCE, MAX_ITERS = 0.999, 5000
 DC_PERCENT = 2.0
@@ -95,7 +96,7 @@ class Views:
         X, scores = self.pair.X, self.pair.scores
         if cut == ONE_WAY:
             return self.one_way
-        return X if scores is None or cut == MUTUAL else X[1 - scores < 0.8]
+        return X if scores is None or cut == MUTUAL else X[1 - scores < RATIO]
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from tqdm import tqdm
 from benchmarks import rendered
 from benchmarks.rendered import SCENES, SIZE, View, intrinsics
 from benchmarks.report import _table, fill
-from cv_densityf.colmap import verify_matches
+from cv_densityf.colmap import _image_ids, verify_matches
 
 Floats = NDArray[np.float64]
 
@@ -37,8 +37,6 @@ N_VIEWS = 12
 ARC = 100.0
 #: The corridor's walls would stand between the arc and the scene.
 ARC_SCENES = tuple(name for name in SCENES if name != "corridor")
-#: COLMAP's number of a pair of images: the first one's id times this and the second one's.
-PAIR_BASE = 2**31 - 1
 #: SIFT ratio below which COLMAP keeps a match: its default, and no ratio test.
 RATIOS = {"ratio 0.8": 0.8, "no ratio test": 1.0}
 
@@ -102,7 +100,7 @@ def mix(names: Sequence[str], ratio: float, folder: Path, seed: int = 0) -> dict
             name_of = dict(connection.execute("SELECT image_id, name FROM images"))
             pairs = connection.execute("SELECT pair_id FROM two_view_geometries WHERE rows > 0")
             scenes = [
-                {int(name_of[i][:-4]) // N_VIEWS for i in divmod(pair_id, PAIR_BASE)}
+                {int(name_of[i][:-4]) // N_VIEWS for i in _image_ids(pair_id)}
                 for (pair_id,) in pairs
             ]
         right = sum(len(scene) == 1 for scene in scenes)

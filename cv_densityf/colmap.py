@@ -172,11 +172,8 @@ def verify_matches(
                     if estimate.engine == "none":
                         failures.append((*_image_ids(pair_id), estimate.reason))
                         continue
-                    n = estimate.n_inliers
-                    held = n >= min_inliers and (
-                        2 * n > len(matches) or coherence(*points, estimate.mask) >= min_coherence
-                    )
-                    row = _row(pair_id, matches, estimate, held)
+                    overlap = _overlap(points, estimate, min_inliers, min_coherence)
+                    row = _row(pair_id, matches, estimate, overlap)
                     verified += row[-2] == UNCALIBRATED
                     n_inliers += row[1]
                     rows.append(row)
@@ -281,12 +278,25 @@ def _image_ids(pair_id: int) -> tuple[int, int]:
     return divmod(pair_id, _PAIR_BASE)
 
 
+def _overlap(
+    points: tuple[NDArray[np.float32], NDArray[np.float32]],
+    estimate: Estimate,
+    min_inliers: int,
+    min_coherence: float,
+) -> bool:
+    """Whether the inliers are enough, and most of the matches or coherent."""
+    n = estimate.n_inliers
+    if n < min_inliers:
+        return False
+    return 2 * n > len(estimate.mask) or coherence(*points, estimate.mask) >= min_coherence
+
+
 def _row(
-    pair_id: int, matches: Indices, estimate: Estimate, held: bool
+    pair_id: int, matches: Indices, estimate: Estimate, overlap: bool
 ) -> tuple[int, int, bytes | None, int, bytes | None]:
     """Give pair_id, rows, data, config and F as the table of two-view geometries has them."""
     F = estimate.F
-    if F is None or F.shape != (3, 3) or not held:
+    if F is None or F.shape != (3, 3) or not overlap:
         return pair_id, 0, None, DEGENERATE, None
     inliers = np.ascontiguousarray(matches[estimate.mask])
     return pair_id, len(inliers), inliers.tobytes(), UNCALIBRATED, F.astype(np.float64).tobytes()
