@@ -1,4 +1,4 @@
-"""``python -m benchmarks real | render | synthetic | stages | scale | paper | reliability``."""
+"""``python -m benchmarks``: one command for each question, listed by ``--help``."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from tqdm import tqdm
 from benchmarks import report
 from benchmarks.data import Pair, load_pairs
 from benchmarks.motions import write_pairs
+from benchmarks.overlap import overlap
 from benchmarks.paper import reproduce
 from benchmarks.peers import METHODS, Method, Settings, choose
 from benchmarks.run import Record, measure, one_thread, warm_up
@@ -127,6 +128,11 @@ def _parser() -> argparse.ArgumentParser:
         "--page", metavar="FILE", help="bring this page's tables, and images/ beside it, up to date"
     )
     paper.set_defaults(run=_paper)
+
+    alike = commands.add_parser("overlap", help="pairs of one scene, and of two: what tells them")
+    alike.add_argument("--data", metavar="DIR", help="folder of .npz files with more pairs")
+    alike.add_argument("--page", metavar="FILE", help="bring the tables of this page up to date")
+    alike.set_defaults(run=_overlap)
 
     reliability = commands.add_parser(
         "reliability", help="random calls beside cv2, load, memory, odd coordinates"
@@ -261,6 +267,11 @@ def _paper(args: argparse.Namespace) -> int:
             images.mkdir(exist_ok=True)
             for picture in folder.glob("paper-*.png"):
                 shutil.copy(picture, images)
+    return 0
+
+
+def _overlap(args: argparse.Namespace) -> int:
+    _show(overlap(args.data), args.page)
     return 0
 
 
