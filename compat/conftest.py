@@ -80,6 +80,9 @@ def pytest_collection_modifyitems(session, config, items):
     if any(item.get_closest_marker("whole_table") for item in items):
         wanted = set(CASES)
     config.stash[_SELECTED] = [id_ for id_ in CASES if id_ in wanted]
+    for item in items:
+        # The first test waits for all calls. Each of these has a limit of its own.
+        item.add_marker(pytest.mark.timeout(func_only=True))
 
 
 def pytest_configure(config):

@@ -19,6 +19,7 @@ from cv_densityf._epipolar import (
     middle,
     point_line_squared,
     polish,
+    refine,
     shift,
 )
 from cv_densityf._parallax import plane_and_parallax
@@ -88,11 +89,16 @@ _GRID = 16
 #: Width of the weights in the polish, in units of the working threshold.
 _POLISH_WIDTH = 0.7
 _POLISH_STEPS = 2
-#: The winner's last steps take weights of this many robust standard deviations: nearly all of what
-#: least squares gets out of normal noise, and little of what heavier tails put in.
-_REFINE_SIGMAS = 3.0
-_REFINE_STEPS = 2
-_NARROWEST = 0.1
+_REFINE_STEPS = 3
+#: The noise that the last steps reckon with, at least, in units of the threshold.
+_NARROWEST = 0.03
+#: For the last steps, right matches are counted within so many sigmas of their lines, wrong ones
+#: between these, in each of so many groups of like reliability; and the density of right ones on
+#: the lines is this share of their number, per sigma.
+_NEARBY = 2.5
+_BESIDE = (4.0, 12.0)
+_GROUPS = 4
+_PEAK = 0.8
 #: Hypotheses of a part of the matches that the others vote on.
 _FINALISTS = 3
 #: The winner has a way to go from where the part left it: in strides of this many steps of the
@@ -321,6 +327,7 @@ class _Pool:
         #: The matches that are not on a dominant plane, if there is one.
         self._off_plane: Bools | None = None
         self._X = X
+        self._reliability = reliability
         self._reliable = reliable
         self._rng = rng
         self._frame = frame or Frame(X)
@@ -456,8 +463,7 @@ class _Pool:
 
     def refined_best(self) -> NDArray[np.float64]:
         """Polish the best hypothesis at the width of its own residuals; in pixels, (3, 3)."""
-        best = self._G[self.best]
-        return _refined(self._frame, best, self._reliable, self.threshold)
+        return self._refined(self._G[self.best], self._squared[self.best])
 
     def _finalists(self, most: int, overlap: float) -> list[int]:
         """Return the indices of the best hypotheses whose inliers overlap by less."""
@@ -490,7 +496,14 @@ class _Pool:
         for _ in range(_STRIDES):
             step = polish(self._frame, G, [width])
             G = G + _STRIDE * (step - G)
-        return _refined(self._frame, step[0], self._reliable, self.threshold)
+        return self._refined(step[0], self._frame.sampson(step)[0])
+
+    def _refined(self, G: Floats, squared: Floats) -> NDArray[np.float64]:
+        noise = _noise(squared[self._reliable], self.threshold)
+        sigma = max(noise, _NARROWEST * self.threshold)
+        doubt = _doubt(squared, sigma, self._reliability)
+        G = refine(self._frame, G, sigma, doubt, noise, _REFINE_STEPS)
+        return np.ascontiguousarray(self._frame.leave(G[None])[0])
 
 
 def _alike(inliers: Floats, one: Floats, overlap: float) -> Bools:
@@ -505,12 +518,23 @@ def _credit(G: Floats) -> Floats:
     return np.sqrt(essential_ratio(G))
 
 
-def _refined(frame: Frame, G: Floats, reliable: Ints, threshold: float) -> NDArray[np.float64]:
-    G = G[None]
-    noise = _noise(frame.sampson(G)[0, reliable], threshold)
-    width = max(_REFINE_SIGMAS * noise, _NARROWEST * threshold)
-    G = polish(frame, G, [width] * _REFINE_STEPS, noise)
-    return np.ascontiguousarray(frame.leave(G)[0])
+def _doubt(squared: Floats, sigma: float, reliability: Floats) -> Floats:
+    """How much more likely each match is wrong than right, if its residual is 0, (n,).
+
+    Wrong matches are as frequent near the lines as beside them, where they are counted; the others
+    near the lines are right. Either is counted among matches of like reliability.
+    """
+    group = np.minimum(reliability * _GROUPS, _GROUPS - 1).astype(np.intp)
+
+    def count(marked: Bools) -> Floats:
+        return np.bincount(group, marked, _GROUPS).astype(float)
+
+    first, last = _BESIDE
+    beside = (squared > (first * sigma) ** 2) & (squared < (last * sigma) ** 2)
+    # Per sigma, and never quite none.
+    wrong = (count(beside) + 0.5) / (last - first)
+    right = np.maximum(count(squared < (_NEARBY * sigma) ** 2) - _NEARBY * wrong, 0.25)
+    return np.asarray((wrong / (_PEAK * right))[group])
 
 
 def _noise(squared: Floats, threshold: float) -> float:

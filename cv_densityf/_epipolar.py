@@ -222,6 +222,9 @@ _NORMAL = np.diag([1.0, 1.0, 0.0])
 #: tells little, for the camera may be of another kind.
 _SHORTFALL = 0.01
 _FOREIGN = 0.03
+#: Degrees of freedom of Student's distribution of right residuals, whose density is then as
+#: (1 + z^2 / 5)^-3.
+_DEGREES = 5.0
 #: By which slopes are taken, of a matrix of unit norm.
 _NUDGE = 1e-4
 #: Of a matrix's entries, row by row, those whose products make its cofactors: the first ones times
@@ -311,18 +314,12 @@ def polish(
     frame: Frame,
     G: Floats,
     scales: Sequence[float | Floats],
-    noise: float | None = None,
     samples: NDArray[np.bool_] | None = None,
 ) -> Floats:
-    """Refine fundamental matrices on all matches, one weighted Gauss-Newton step per scale.
+    """Step from fundamental matrices towards the least squares of all matches near their lines.
 
-    Minimises the Sampson distances under Geman-McClure weights ``1 / (1 + (r / scale)^2)^2`` over
-    the seven degrees of freedom of a matrix of rank 2: a step in the tangent space at
-    ``U diag(s_1, s_2, 0) V^T``, then the nearest matrix of rank 2 (Absil, Mahony and Sepulchre,
-    "Optimization algorithms on matrix manifolds", 2008). The gradient is exact: to hold the
-    denominator of the Sampson distance fixed, as iteratively reweighted least squares do, would
-    end beside the minimum, far beside it where the baseline is short (Chojnacki, Brooks, van den
-    Hengel and Gawley, "On the fitting of surfaces to data with covariances", PAMI 2000).
+    One weighted Gauss-Newton step per scale: minimises the Sampson distances under Geman-McClure
+    weights ``1 / (1 + (r / scale)^2)^2`` over the seven degrees of freedom of a matrix of rank 2.
 
     Parameters
     ----------
@@ -332,11 +329,6 @@ def polish(
         Starting matrices in the frame.
     scales : sequence of float or of arrays of shape (m,)
         Width of the weights in pixels, step by step.
-    noise : float, optional
-        Standard deviation of right residuals, pixels. If given, the cameras weigh in: how far
-        `essential_ratio` falls short of 1 is one more residual, of standard deviation
-        ``_SHORTFALL`` and with Cauchy's weights of width ``_FOREIGN``. It tells where the matches
-        do not, and loses its say where the cameras seem to be of another kind.
     samples : array, shape (k, n), bool, optional
         The matches that the first step is restricted to, for each matrix: k is m, or m is 1 and k
         matrices come of the same one. An infinite scale gives them all the same weight.
@@ -344,46 +336,121 @@ def polish(
     Returns
     -------
     array, shape (m, 3, 3), or (k, 3, 3)
-        Refined matrices of rank 2 and unit norm, in the frame.
+        Matrices of rank 2 and unit norm, in the frame.
     """
     for scale in scales:
-        m = len(G)
-        G, U, S, Vt = _rank_two(G)
-        # The directions u_i v_j^T in which the rank stays two, so not the last, u_3 v_3^T; in place
-        # of u_1 v_1^T and u_2 v_2^T, rows 0 and 4, the one of both that keeps the norm.
-        outer = (U.transpose(0, 2, 1)[:, :, None, :, None] * Vt[:, None, :, None]).reshape(m, 9, 9)
-        outer[:, 4] = S[:, :1] * outer[:, 4] - S[:, 1:2] * outer[:, 0]
-        tangent = outer[:, 1:8]
-        algebraic, norm = frame.errors(G)
-        norm += _TINY
+        at = _Linearized(frame, G)
         width = np.asarray(scale, dtype=float).reshape(-1, 1) * frame.scale
-        squared = algebraic * algebraic / norm
-        weight = 1.0 / (1.0 + squared / width**2)
-        weight *= weight / norm
+        weight = 1.0 / (1.0 + at.squared / width**2)
+        weight *= weight
         if samples is not None:
             weight, samples = weight * samples, None
-        half = tangent @ frame.gram(weight)
-        hessian = half @ tangent.transpose(0, 2, 1)
-        gradient = half @ G.reshape(m, 9, 1)
+        G = at.moved(*at.normal_equations(weight))
+    return _rank_two(G)[0]
+
+
+def refine(
+    frame: Frame, G: Floats, sigma: float, doubt: Floats | float, noise: float, steps: int
+) -> Floats:
+    """Step from a matrix near the right one towards the most likely one, given all matches.
+
+    Residuals of right matches have Student's distribution with five degrees of freedom, for noise
+    has tails; those of wrong ones are even near the lines. A match counts as far as it is likely to
+    be right. The cameras weigh in: how far `essential_ratio` falls short of 1 is one more
+    residual, of standard deviation ``_SHORTFALL`` and with Cauchy's weights of width ``_FOREIGN``.
+    It tells where the matches do not, and loses its say where the cameras seem to be of another
+    kind.
+
+    Parameters
+    ----------
+    frame : Frame
+        The matches.
+    G : array, shape (3, 3)
+        Starting matrix in the frame.
+    sigma : float
+        Scale of Student's distribution, pixels.
+    doubt : array, shape (n,), or float
+        How much more likely, at a residual of 0, a match is wrong than right.
+    noise : float
+        Standard deviation of right residuals, pixels: how strong the cameras are beside them.
+    steps : int
+        How many to take.
+
+    Returns
+    -------
+    array, shape (3, 3)
+        Matrix of rank 2 and unit norm, in the frame.
+    """
+    G = G[None]
+    for _ in range(steps):
+        at = _Linearized(frame, G)
+        near = 1.0 / (1.0 + at.squared / (_DEGREES * (sigma * frame.scale) ** 2))
+        # The density of right ones is as near ** 3.
+        density = near * near * near
+        hessian, gradient = at.normal_equations(near * density / (density + doubt))
+        nudge = _NUDGE * at.tangent.reshape(7, 3, 3)
+        lack = 1.0 - essential_ratio(at.G + np.concatenate([0.0 * nudge[:1], nudge, -nudge]))
+        slope = (lack[1:8] - lack[8:]) / (2.0 * _NUDGE)
+        pull = np.square(noise * frame.scale / _SHORTFALL) / (1.0 + (lack[0] / _FOREIGN) ** 2)
+        hessian += pull * slope[:, None] * slope
+        gradient += (pull * lack[0] * slope)[:, None]
+        G = at.moved(hessian, gradient)
+    return np.asarray(_rank_two(G)[0][0])
+
+
+class _Linearized:
+    """Residuals at matrices of rank 2, and how they change with these: a Gauss-Newton step.
+
+    A step goes along the tangent space at ``U diag(s_1, s_2, 0) V^T``, and ends at the nearest
+    matrix of rank 2 (Absil, Mahony and Sepulchre, "Optimization algorithms on matrix manifolds",
+    2008). The gradient is exact: to hold the denominator of the Sampson distance fixed, as
+    iteratively reweighted least squares do, would end beside the minimum, far beside it where the
+    baseline is short (Chojnacki, Brooks, van den Hengel and Gawley, "On the fitting of surfaces to
+    data with covariances", PAMI 2000).
+
+    Attributes
+    ----------
+    G : array, shape (m, 3, 3)
+        The nearest matrices of rank 2.
+    tangent : array, shape (m, 7, 9)
+        Directions that keep rank and norm.
+    squared : array, shape (m, n)
+        Squared Sampson distances, in the frame.
+    """
+
+    __slots__ = ("G", "_frame", "_norm", "squared", "tangent")
+
+    def __init__(self, frame: Frame, G: Floats) -> None:
+        self.G, U, S, Vt = _rank_two(G)
+        # The directions u_i v_j^T in which the rank stays two, so not the last, u_3 v_3^T; in place
+        # of u_1 v_1^T and u_2 v_2^T, rows 0 and 4, the one of both that keeps the norm.
+        outer = U.transpose(0, 2, 1)[:, :, None, :, None] * Vt[:, None, :, None]
+        outer = outer.reshape(-1, 9, 9)
+        outer[:, 4] = S[:, :1] * outer[:, 4] - S[:, 1:2] * outer[:, 0]
+        self.tangent = outer[:, 1:8]
+        algebraic, self._norm = frame.errors(self.G)
+        self._norm += _TINY
+        self.squared = algebraic * algebraic / self._norm
+        self._frame = frame
+
+    def normal_equations(self, weight: Floats) -> tuple[Floats, Floats]:
+        """Hessian (m, 7, 7) and gradient (m, 7, 1) of least squares with weights (m, n)."""
+        m = len(weight)
+        weight = weight / self._norm
+        half = self.tangent @ self._frame.gram(weight)
+        gradient = half @ self.G.reshape(-1, 9, 1)
         # The denominator's part, half the derivative of x^T G^T D G x + x'^T G D G^T x'.
-        moments = frame.moments(weight * squared)
-        drift = _NORMAL @ G @ moments[:, 0] + moments[:, 1] @ G @ _NORMAL
-        gradient -= tangent @ drift.reshape(-1, 9, 1)
-        if noise is not None:
-            nudge = _NUDGE * tangent.reshape(m, 7, 3, 3)
-            nudged = G[:, None] + np.concatenate([0.0 * nudge[:, :1], nudge, -nudge], 1)
-            lack = 1.0 - essential_ratio(nudged.reshape(-1, 3, 3)).reshape(m, 15)
-            lack, slope = lack[:, :1], (lack[:, 1:8] - lack[:, 8:]) / (2.0 * _NUDGE)
-            pull = (
-                np.square(noise * frame.scale / _SHORTFALL) / (1.0 + (lack / _FOREIGN) ** 2) * slope
-            )
-            hessian += pull[:, :, None] * slope[:, None]
-            gradient += (pull * lack)[:, :, None]
+        moments = self._frame.moments(weight * self.squared)
+        drift = _NORMAL @ self.G @ moments[:, 0] + moments[:, 1] @ self.G @ _NORMAL
+        gradient -= self.tangent @ drift.reshape(m, 9, 1)
+        return half @ self.tangent.transpose(0, 2, 1), gradient
+
+    def moved(self, hessian: Floats, gradient: Floats) -> Floats:
+        """Matrices (m, 3, 3) a step further, of rank 2 but for the second order."""
         damping = 1e-9 * np.einsum("mkk->m", hessian) + _TINY
         step = -np.linalg.solve(hessian + damping[:, None, None] * _EYE, gradient)
         step *= np.minimum(1.0, 0.5 / (np.sqrt((step * step).sum(axis=1, keepdims=True)) + _TINY))
-        G = G + (step.transpose(0, 2, 1) @ tangent).reshape(-1, 3, 3)
-    return _rank_two(G)[0]
+        return np.asarray(self.G + (step.transpose(0, 2, 1) @ self.tangent).reshape(-1, 3, 3))
 
 
 def _rank_two(G: Floats) -> tuple[Floats, Floats, Floats, Floats]:

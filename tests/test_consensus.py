@@ -9,6 +9,7 @@ from scipy.stats import norm
 from cv_densityf import _consensus, _engine, _stopwatch
 from cv_densityf._consensus import (
     _Ballot,
+    _doubt,
     _noise,
     _Pool,
     _samples_needed,
@@ -106,7 +107,7 @@ def test_is_as_good_as_least_squares_where_all_matches_are_right():
 
 def test_wrong_matches_cost_little():
     search, best = errors_beside_least_squares(1.0, inlier_ratio=0.5, noise=0.5, n=600)
-    assert np.median(search) < 1.6 * np.median(best)
+    assert np.exp(np.log(search / best).mean()) < 1.15
 
 
 def test_a_generous_threshold_costs_little():
@@ -291,7 +292,7 @@ def test_two_different_answers_are_no_agreement(monkeypatch):
     X = scene_of(0).X
     answers = iter(np.random.default_rng(0).normal(size=(99, 3, 3)) * [1e-6, 1e-6, 1e-3])
     monkeypatch.setattr(_consensus, "draw", lambda *_, **__: next(answers))
-    monkeypatch.setattr(_consensus, "polish", lambda frame, G, scales, noise=None: G)
+    monkeypatch.setattr(_consensus, "polish", lambda frame, G, scales: G)
     found = find(X)
     assert found.n_draws >= 2 * len(_consensus.ROUNDS) - 1
     assert len(found.votes) == found.n_draws
@@ -664,7 +665,7 @@ def test_finalists_are_the_best_three_of_different_inliers(seed, monkeypatch):
     for i in np.argsort(-votes):
         if len(expected) < 3 and (share[i, expected] < 0.93).all():
             expected.append(i)
-    monkeypatch.setattr(_consensus, "polish", lambda frame, G, scales, noise=None: G)
+    monkeypatch.setattr(_consensus, "polish", lambda frame, G, scales: G)
     pool.working = 1.0
     wider = pool.before(scene_of(1).X)
     assert wider.working == 1.0
@@ -915,6 +916,37 @@ def test_noise_among_wrong_matches_nearby():
     rng = np.random.default_rng(0)
     r = np.concatenate([rng.normal(0, 0.2, 2000), rng.uniform(-3, 3, 2000)])
     assert _noise(r**2, 1.0) == pytest.approx(0.2, rel=0.25)
+
+
+@pytest.mark.parametrize("sigma", [0.1, 0.5])
+def test_doubt_is_how_much_likelier_a_match_on_its_line_is_wrong_than_right(sigma):
+    """Right matches have normal noise, wrong ones lie anywhere up to 300 px off."""
+    rng = np.random.default_rng(0)
+    n = 20_000
+    reliability = rng.permutation(n) / n
+    is_right = rng.random(n) < 0.1 + 0.8 * (reliability > 0.5)
+    r = np.where(is_right, rng.normal(0, sigma, n), rng.uniform(-300, 300, n))
+    doubt = _doubt(r**2, sigma, reliability)
+    for share, those in ((0.1, reliability < 0.5), (0.9, reliability > 0.5)):
+        # Densities at 0 of either kind.
+        expected = (1 - share) / 600 / (share / (np.sqrt(2 * np.pi) * sigma))
+        assert np.exp(np.log(doubt[those]).mean()) == pytest.approx(expected, rel=0.6)
+    assert np.median(doubt[reliability < 0.5]) > 20 * np.median(doubt[reliability > 0.5])
+
+
+def test_doubt_of_matches_of_one_reliability_is_the_same_in_any_order():
+    rng = np.random.default_rng(0)
+    r = np.concatenate([rng.normal(0, 0.5, 300), rng.uniform(0, 300, 300)])
+    doubt, mixed = (_doubt(x**2, 0.5, np.ones(600)) for x in (r, rng.permutation(r)))
+    np.testing.assert_array_equal(doubt, mixed)
+    assert np.ptp(doubt) == 0
+
+
+def test_doubt_is_finite_and_not_0_where_there_is_nothing_to_count():
+    for squared in (np.zeros(40), np.full(40, 1e300)):
+        doubt = _doubt(squared, 0.5, np.zeros(40))
+        assert (doubt > 0).all()
+        assert np.isfinite(doubt).all()
 
 
 def test_noise_is_of_residuals_within_three_thresholds():

@@ -21,6 +21,7 @@ from cv_densityf._epipolar import (
     middle,
     point_line_squared,
     polish,
+    refine,
     residuals,
     sampson_distance,
 )
@@ -382,54 +383,75 @@ def test_polish_ends_in_a_minimum_of_the_robust_cost(seed, strip):
             assert robust_cost(frame, near[None] / np.linalg.norm(near), 2.0) > least * (1 - 1e-9)
 
 
-def joint_cost(frame, G, scale, noise):
-    """Geman and McClure's cost in squared noise, and Cauchy's of how unlike cameras G is."""
-    lack = 1 - essential_ratio(G)[0]
+def unlikeliness(frame, G, sigma, doubt, noise):
+    """Minus the log likelihood of residuals and cameras, in squared noise."""
+    density = (1 + frame.sampson(G) / (5 * sigma**2)) ** -3.0
+    matches = -np.log(density + doubt).sum(axis=1) * (5 / 3) * sigma**2
+    lack = 1 - essential_ratio(G)
     short, foreign = _epipolar._SHORTFALL, _epipolar._FOREIGN
-    camera = (foreign / short) ** 2 * np.log1p((lack / foreign) ** 2)
-    return robust_cost(frame, G, scale) * (scale / noise) ** 2 + camera
+    return matches + (noise * foreign / short) ** 2 * np.log1p((lack / foreign) ** 2)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_refinement_ends_where_no_matrix_nearby_is_likelier(seed):
+    scene = noisy_scene(seed, n=300, inlier_ratio=0.5)
+    frame = Frame(scene.X)
+    doubt = np.random.default_rng(seed).uniform(0.01, 0.3, 300)
+    G = refine(frame, frame.enter(scene.F[None])[0], 0.5, doubt, 0.0, 200)
+    assert np.linalg.norm(G) == pytest.approx(1)
+    assert np.linalg.svd(G)[1][2] < 1e-14
+    least = unlikeliness(frame, G[None], 0.5, doubt, 0.0)
+    rng = np.random.default_rng(seed)
+    for size in (1e-4, 1e-5):
+        U, S, Vt = np.linalg.svd(G + size * rng.normal(size=(40, 3, 3)))
+        S[:, 2] = 0
+        near = (U * S[:, None]) @ Vt
+        near /= np.linalg.norm(near, axis=(1, 2), keepdims=True)
+        assert (unlikeliness(frame, near, 0.5, doubt, 0.0) > least - 1e-9 * abs(least)).all()
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_with_the_cameras_polish_lowers_the_joint_cost(seed):
+def test_with_the_cameras_refinement_is_likelier(seed):
     """Few and noisy matches, so that the cameras have a say."""
     scene = noisy_scene(seed, n=40, noise=2.0)
     frame = Frame(scene.X)
-    without = polish(frame, frame.enter(scene.F[None]), [6.0] * 30)
-    both = without
-    for _ in range(8):
-        both = polish(frame, both, [6.0], 2.0)
-    before, after = (joint_cost(frame, G, 6.0, 2.0) for G in (without, both))
-    assert after < before + 1e-3 * before
-    assert essential_ratio(both)[0] > essential_ratio(without)[0] - 1e-3
+    without = refine(frame, frame.enter(scene.F[None])[0], 2.0, 1e-3, 0.0, 30)
+    both = refine(frame, without, 2.0, 1e-3, 2.0, 8)
+    before, after = unlikeliness(frame, np.stack([without, both]), 2.0, 1e-3, 2.0)
+    assert after < before + 1e-3 * abs(before)
+    ratios = essential_ratio(np.stack([without, both]))
+    assert ratios[1] > ratios[0] - 1e-3
+
+
+def refined_errors(n, noise, doubt, camera_noise, seeds=range(40)):
+    """Errors of refinement from the true F; half of the matches are wrong and fill the images."""
+    errors = []
+    for seed in seeds:
+        scene = noisy_scene(seed, n=n, inlier_ratio=0.5, noise=noise)
+        frame = Frame(scene.X)
+        G = refine(
+            frame,
+            frame.enter(scene.F[None])[0],
+            noise,
+            np.where(scene.inliers, *doubt),
+            camera_noise,
+            4,
+        )
+        errors.append(sampson_distance(frame.leave(G[None])[0], exact_scene(seed, 300).X).mean())
+    return np.log(errors)
 
 
 @pytest.mark.parametrize(("n", "noise"), [(200, 2.0), (500, 1.0), (2000, 0.5)])
 def test_cameras_hardly_move_what_matches_tell(n, noise):
-    """With normal noise least squares alone are as good as can be; wrong ones fill the images."""
-    ratios = []
-    for seed in range(40):
-        scene = noisy_scene(seed, n=n, inlier_ratio=0.5, noise=noise)
-        frame = Frame(scene.X)
-        start = frame.enter(scene.F[None])
-        true = exact_scene(seed, 300).X
-        without, both = (
-            sampson_distance(
-                frame.leave(polish(frame, start, [3 * noise] * 4, told))[0], true
-            ).mean()
-            for told in (None, noise)
-        )
-        ratios.append(both / without)
-    assert np.exp(np.log(ratios).mean()) < 1.05
+    without, both = (refined_errors(n, noise, (0.02, 0.02), told) for told in (0.0, noise))
+    assert np.exp((both - without).mean()) < 1.05
 
 
-def test_matches_without_noise_need_no_cameras():
-    scene = noisy_scene(0)
-    frame = Frame(scene.X)
-    start = perturbed(frame, scene.F, 0)
-    np.testing.assert_array_equal(
-        polish(frame, start, [3.0] * 3, 0.0), polish(frame, start, [3.0] * 3)
+def test_doubtful_matches_hardly_move_refinement():
+    trusted, doubted = (
+        refined_errors(1000, 1.0, doubt, 0.0) for doubt in ((1e-9, 1e-9), (1e-9, 1e3))
     )
+    assert np.exp((doubted - trusted).mean()) < 0.9
 
 
 @pytest.mark.parametrize("seed", SEEDS)
