@@ -466,6 +466,7 @@ def _report(
         "median_residual": _median_residual(estimate.F, X[estimate.mask], robust),
         "engine": estimate.engine,
         "n_draws": estimate.n_draws,
+        "agreed": estimate.agreed,
         "cv2": plain,
         "timings_ms": {
             **{name: round(value, 3) for name, value in timings.items()},

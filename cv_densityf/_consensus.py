@@ -22,7 +22,7 @@ from cv_densityf._epipolar import (
     refine,
     shift,
 )
-from cv_densityf._parallax import plane_and_parallax
+from cv_densityf._parallax import FEWEST, plane_and_parallax
 from cv_densityf._prefilter import COHERENT, coherence
 from cv_densityf._stopwatch import Stopwatch
 
@@ -67,6 +67,8 @@ _CONTAINED = 0.9
 _SIGNIFICANT = 2.0
 #: Working thresholds within which a match is on a plane.
 _PLANE_WIDTH = 2.0
+#: With more than this share of the inliers on a plane the reason says so.
+_PLANAR = 0.9
 #: Draws from parts whose sizes differ by less than this factor are not independent.
 _DISTINCT = 1.4
 #: Largest size of the samples of the local optimisation, how many working thresholds from the
@@ -125,6 +127,7 @@ class Consensus:
     reliability: NDArray[np.float64]
     votes: tuple[float, ...]
     n_draws: int
+    agreed: bool
     reason: str
 
 
@@ -211,13 +214,19 @@ def search(
     F = pool.refined_best() if others is None else pool.before(others - centre).settled_best()
     F = shift(-centre[2:]).T @ F @ shift(-centre[:2])
     watch.lap("polish")
-    again = ", found again by another" if agreed and pool.agrees_off_plane() else ""
-    reason = f"the hypothesis with {pool.virtue} of {n_draws} draws{again}"
+    agreed = agreed and pool.agrees_off_plane()
+    again = "found again by another" if agreed else "found by no other"
+    reason = f"the hypothesis with {pool.virtue} of {n_draws} draws, {again}"
     if in_vain:
         reason += (
             ", which ended early: matches lie together only as by chance, and so do the inliers"
         )
-    return Consensus(F, reliability, tuple(pool.votes.tolist()), n_draws, reason)
+    elif pool.planar > _PLANAR:
+        reason += (
+            f"; {pool.planar:.0%} of its inliers suit one plane, or a camera that only turned, "
+            "which leave F open"
+        )
+    return Consensus(F, reliability, tuple(pool.votes.tolist()), n_draws, agreed, reason)
 
 
 class _Part(NamedTuple):
@@ -326,6 +335,8 @@ class _Pool:
         self.best = 0
         #: The matches that are not on a dominant plane, if there is one.
         self._off_plane: Bools | None = None
+        #: The matches on the plane that most inliers suit, dominant or not.
+        self._planar = np.zeros(len(X), dtype=bool)
         self._X = X
         self._reliability = reliability
         self._reliable = reliable
@@ -404,6 +415,7 @@ class _Pool:
             )
         except np.linalg.LinAlgError:
             return
+        self._planar = ~off_plane
         if len(G):
             self._off_plane = off_plane
             self._join(G, np.zeros(len(G)))
@@ -440,6 +452,12 @@ class _Pool:
         votes = self._ballot.part(rows).count(part.sampson(G), self.working) * _credit(G)
         G = G[[votes.argmax()]]
         self._append(G, *self._poll(G), [0])
+
+    @property
+    def planar(self) -> float:
+        """Share of the best hypothesis's inliers that are on one plane."""
+        planar = self._planar[self.near_best(1.0)]
+        return float(planar.mean()) if len(planar) > FEWEST else 0.0
 
     @property
     def virtue(self) -> str:
@@ -654,7 +672,7 @@ def eight_point_ransac(
     if best is None:
         return None
     reason = f"{most} of the {n} matches that passed the paper's rule agree"
-    return Consensus(best, np.ones(n), (float(most),), drawn, reason)
+    return Consensus(best, np.ones(n), (float(most),), drawn, False, reason)
 
 
 def _samples_needed(inlier_ratio: float, confidence: float) -> float:

@@ -26,16 +26,13 @@ DENSITIES = get_args(Density)
 
 #: With fewer matches cv2 turns RANSAC into LMEDS, and there is no density to speak of.
 MIN_FILTERED = 15
-#: More matches than this do not help to find F: a seeded, well spread part of this size searches.
+#: More matches than this do not help to find F: a seeded part of this size searches.
 MAX_SEARCHED = 5_000
 #: They do help to choose and to measure it, up to what memory should bear.
 MAX_REFINED = 100_000
 #: Of as many of those that search the density is looked at, and hypotheses are drawn; of all where
 #: no two of these agree.
 MAX_RANKED = 1_000
-#: A part is spread over cells of the first image, and in each of them over cells of the second:
-#: this many to the longer side.
-_CELLS = (16, 8)
 #: The noise is the data's, and the caller's threshold rules the mask: the search has this part of
 #: the points' spread for its threshold, 1 to 3 px in a photograph, as far as it is within this
 #: factor of the caller's; below half of it, right matches may not agree any more.
@@ -62,13 +59,16 @@ class Estimate:
         Inliers by the method's own rule.
     kept : array, shape (n,), bool
         The dense part: matches the density rule holds reliable. Of more than a thousand it looks at
-        a thousand, spread over both images, and at all where these lead to no agreement. Where
-        cv2's own call answered, all finite matches.
+        a thousand, and at all where these lead to no agreement. Where cv2's own call answered, all
+        finite matches.
     reliability : array, shape (n,), float64
         From 0 (isolated) to 1 (densest); NaN for matches whose density was not looked at. Where
         cv2's own call answered, 1 for finite matches and 0 for others.
     n_draws : int
         Hypotheses drawn; 0 if cv2's own call answered.
+    agreed : bool
+        Whether another draw found the same, which is hardly ever by accident. False where cv2's own
+        call answered, and for ``density="paper"``.
     engine : str
         What drew: ``"density"``, or the name of cv2's method that was called instead.
     reason : str
@@ -91,6 +91,7 @@ class Estimate:
     kept: NDArray[np.bool_]
     reliability: NDArray[np.float64]
     n_draws: int
+    agreed: bool
     engine: str
     reason: str
     timings: dict[str, float] = field(default_factory=dict)
@@ -157,10 +158,11 @@ def _estimate(
     heard = rows
     if len(rows) > MAX_SEARCHED:
         rng = np.random.default_rng(abs(seed))
-        heard = rows[_spread(X[rows], MAX_REFINED, rng)]
-        rows = heard[_spread(X[heard], MAX_SEARCHED, rng)]
+        heard = rows[_some(len(rows), MAX_REFINED, rng)]
+        rows = heard[_some(len(heard), MAX_SEARCHED, rng)]
     Z = X[rows] if len(rows) < n else X
-    if _on_a_line(Z):
+    about = middle(Z)
+    if _on_a_line(Z, about):
         return _plain(
             X,
             finite,
@@ -171,7 +173,6 @@ def _estimate(
     trust = None if scores is None else scores[rows]
     if trust is None and robust.best_first:
         trust = -rows.astype(np.float64)
-    about = middle(Z)
     asked: dict[str, Any] = {
         "threshold": _search_threshold(about[1], robust, density),
         "confidence": robust.confidence,
@@ -219,6 +220,7 @@ def _estimate(
         kept=kept,
         reliability=reliability,
         n_draws=found.n_draws,
+        agreed=found.agreed,
         engine="density",
         reason=found.reason,
         timings=watch.laps,
@@ -239,14 +241,14 @@ def _search_threshold(spread: float, robust: Robust, density: str) -> float:
 def _rankings(
     X: NDArray[np.float64], trust: NDArray[np.float64] | None, seed: int, watch: Stopwatch
 ) -> Iterator[tuple[NDArray[np.float64], bool]]:
-    """Reliability of a part of the better half by score, spread if it is large; then of all.
+    """Reliability of a part of the better half by score; then of all.
 
     With each, whether the matches lie together more than by chance.
     """
     n = len(X)
     if n > MAX_RANKED:
         better = np.arange(n) if trust is None else best_scored(trust, max(n // 2, MAX_RANKED))
-        rows = better[_spread(X[better], MAX_RANKED, np.random.default_rng(abs(seed)))]
+        rows = better[_some(len(better), MAX_RANKED, np.random.default_rng(abs(seed)))]
         reliability, _, together = contrast_support(X, trust, rows)
         watch.lap("density")
         yield reliability, together
@@ -255,33 +257,9 @@ def _rankings(
     yield reliability, together
 
 
-def _spread(X: NDArray[np.float64], size: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Draw ``size`` rows that lie in both images as all do, in rising order; all of fewer.
-
-    The rows are lined up cell by cell, neighbours next to each other, and cut into ``size`` runs of
-    equal length; one of each is drawn.
-    """
-    if len(X) <= size:
-        return np.arange(len(X))
-    first, second = _CELLS
-    centre, deviation = middle(X[:: max(1, len(X) // MAX_SEARCHED)])
-    X = X.clip(centre - FAR * deviation, centre + FAR * deviation)
-    cell = _winding(X[:, :2], first) * second**2 + _winding(X[:, 2:], second)
-    order = np.argsort(cell.astype(np.uint16), kind="stable")
-    edges = np.arange(size + 1) * len(X) // size
-    places = edges[:-1] + (rng.random(size) * np.diff(edges)).astype(np.intp)
-    return np.sort(order[places])
-
-
-def _winding(points: NDArray[np.float64], side: int) -> NDArray[np.intp]:
-    """Give each point the number of its cell on a path up and down the columns of a grid."""
-    # Along columns: numpy takes several times as long across rows of two.
-    x, y = np.ascontiguousarray(points.T)
-    x, y = x - x.min(), y - y.min()
-    cells = side / max(float(x.max()), float(y.max()), 1e-300)
-    column = np.minimum(x * cells, side - 1).astype(np.intp)
-    row = np.minimum(y * cells, side - 1).astype(np.intp)
-    return np.asarray(column * side + np.where(column % 2 == 1, side - 1 - row, row))
+def _some(n: int, size: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Draw ``size`` of n rows, in rising order; all of fewer."""
+    return np.arange(n) if n <= size else np.sort(rng.choice(n, size, replace=False, shuffle=False))
 
 
 def finite_in_cv2(X: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -290,9 +268,14 @@ def finite_in_cv2(X: NDArray[np.floating]) -> NDArray[np.bool_]:
         return np.asarray(np.isfinite(X.astype(np.float32)).all(axis=1))
 
 
-def _on_a_line(X: NDArray[np.float64]) -> bool:
-    """Whether an image's points lie on one line, or on one spot, as far as float32 can tell."""
-    columns = np.ascontiguousarray(X.T)
+def _on_a_line(X: NDArray[np.float64], about: tuple[NDArray[np.floating], float]) -> bool:
+    """Whether an image's points lie on one line, or on one spot, as far as float32 can tell.
+
+    What lies far out from the centre and spread ``about`` is drawn in: the others would look like
+    one spot from there.
+    """
+    centre, spread = about
+    columns = np.ascontiguousarray(X.clip(centre - FAR * spread, centre + FAR * spread).T)
     largest = np.abs(columns).max(axis=1)
     centred = columns - columns.mean(axis=1, keepdims=True)
     covariance = centred @ centred.T / len(X)
@@ -338,6 +321,7 @@ def _plain(
         kept=finite,
         reliability=finite.astype(np.float64),
         n_draws=0,
+        agreed=False,
         engine=name,
         reason=reason,
         timings=watch.laps,

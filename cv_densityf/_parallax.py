@@ -12,7 +12,7 @@ Bools = NDArray[np.bool_]
 
 #: A plane is dominant with at least this share of the inliers, and so many: six are always on one.
 _DOMINANT = 0.7
-_FEWEST = 12
+FEWEST = 12
 #: Steps to the plane of most inliers, each with little weight for what is off the last one's.
 _STEPS = 3
 #: Pairs of matches tried, and how many of the hypotheses through them are worth a polish.
@@ -70,7 +70,7 @@ def plane_and_parallax(
     off_plane = squared >= 1.0
     on_plane = np.count_nonzero(inliers & ~off_plane)
     n = np.count_nonzero(off_plane)
-    if on_plane < max(_FEWEST, _DOMINANT * np.count_nonzero(inliers)) or n < 2:
+    if on_plane < max(FEWEST, _DOMINANT * np.count_nonzero(inliers)) or n < 2:
         return np.empty((0, 3, 3)), off_plane
     first = rng.integers(n, size=_PAIRS)
     second = (first + rng.integers(1, n, size=_PAIRS)) % n

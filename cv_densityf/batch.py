@@ -222,6 +222,7 @@ def _failure(pair: Pair, reason: str) -> Estimate:
         kept=np.zeros(n, dtype=bool),
         reliability=np.full(n, np.nan),
         n_draws=0,
+        agreed=False,
         engine="none",
         reason=reason,
     )

@@ -758,8 +758,24 @@ def test_the_reason_tells_of_agreement(monkeypatch):
     X = scene_of(0, inlier_ratio=0.9, noise=0.2).X
     found = find(X)
     assert found.reason.endswith(f" {found.n_draws} draws, found again by another")
+    assert found.agreed
     monkeypatch.setattr(_Pool, "agrees", lambda *_: False)
-    assert find(X).reason.endswith(" draws")
+    assert find(X).reason.endswith(" draws, found by no other")
+
+
+@pytest.mark.parametrize("wrong", [0, 200])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_reason_tells_of_matches_that_leave_f_open(seed, wrong):
+    """Those of one homography do, those of a scene of many depths do not."""
+    rng = np.random.default_rng(seed)
+    H = np.array([[1.1, 0.1, 30.0], [-0.1, 1.0, -20.0], [rng.uniform(-1e-4, 1e-4), 1e-4, 1.0]])
+    first = rng.uniform(0, [1280, 960], (400, 2))
+    second = np.hstack([first, np.ones((400, 1))]) @ H.T
+    plane = np.hstack([first, second[:, :2] / second[:, 2:]])
+    stray = rng.uniform(0, [1280, 960] * 2, (wrong, 4))
+    for X, open_ in ((plane, True), (true_matches(seed), False)):
+        X = np.vstack([X + rng.normal(0, 0.3, (400, 4)), stray])
+        assert ("leave F open" in find(X).reason) == open_
 
 
 def test_the_watch_tells_draws_from_the_rest(monkeypatch):
