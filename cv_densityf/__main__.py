@@ -75,13 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Outside of the handlers: what the program raises is not ours to explain.
         return run_script(options)
     try:
-        code: int = options.run(options)
-        sys.stdout.flush()
-        return code
-    except BrokenPipeError:
-        # The reader of our output, such as `head`, has had enough.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return FOUND
+        return int(options.run(options))
     except OSError as error:
         where = f"{error.filename}: " if error.filename is not None else ""
         return _complain(f"{where}{error.strerror or error}", WRONG_USE)
@@ -94,8 +88,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _complain(message: str, code: int) -> int:
-    print(f"cv-densityf: {message}", file=sys.stderr)
+    # To print into None would be to print to standard output.
+    if sys.stderr is not None:
+        print(f"cv-densityf: {message}", file=sys.stderr)
     return code
+
+
+def _say(*words: object, sep: str = " ") -> None:
+    """Print, and do without where the reader, such as `head`, has had enough."""
+    try:
+        print(*words, sep=sep, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class _Parser(argparse.ArgumentParser):
@@ -295,7 +299,7 @@ def _add_verify(commands: argparse._SubParsersAction[Any]) -> None:
 @contextmanager
 def _stage(name: str, timings: dict[str, float]) -> Iterator[None]:
     """Time a stage in milliseconds, and name it on the terminal as long as it runs."""
-    shown = sys.stderr.isatty()
+    shown = sys.stderr is not None and sys.stderr.isatty()
     if shown:
         print(f"{name} ...", end="", file=sys.stderr, flush=True)
     start = time.perf_counter()
@@ -347,6 +351,7 @@ def _run_match(options: argparse.Namespace) -> int:
     timings: dict[str, float] = {}
     images: tuple[NDArray[Any] | None, NDArray[Any] | None] = (None, None)
     words: list[str] = []
+    bare: list[str] = []
     scores: Floats | None
     if options.points is not None:
         with _stage("reading", timings):
@@ -362,10 +367,16 @@ def _run_match(options: argparse.Namespace) -> int:
             features = [detect(image, **limits) for image in images if image is not None]
         with _stage("matching", timings):
             matches = match_features(*features, ratio=options.ratio)
+        bare = [
+            p for p, found in zip(options.images, features, strict=True) if not len(found.points)
+        ]
         X, scores = matches.X, matches.scores
     robust = Robust(
         method_flag(options.method), options.threshold, options.confidence, options.max_iters
     )
+    if robust.best_first and scores is not None:
+        order = np.argsort(-scores, kind="stable")
+        X, scores = X[order], scores[order]
     calls: dict[str, Callable[[], Any]] = {
         "estimating": lambda: estimate_fundamental(
             X[:, :2],
@@ -380,9 +391,6 @@ def _run_match(options: argparse.Namespace) -> int:
             random_state=options.seed,
         )
     }
-    plain_X = X
-    if robust.best_first and scores is not None:
-        plain_X = X[np.argsort(-scores, kind="stable")]
     n_finite = int(finite_in_cv2(X).sum())
     same_call = n_finite == len(X) and (
         options.density == "off"
@@ -391,7 +399,7 @@ def _run_match(options: argparse.Namespace) -> int:
     )
     compared = options.method != "usac_accurate" or len(X) <= GRAPH_CUT_MAX
     if compared and not same_call:
-        calls["plain cv2"] = lambda: robust.plain(plain_X[:, :2], plain_X[:, 2:])
+        calls["plain cv2"] = lambda: robust.plain(X[:, :2], X[:, 2:])
     with _stage("estimating", timings):
         results, processor = _timed(calls)
     timings.update(processor)
@@ -400,7 +408,7 @@ def _run_match(options: argparse.Namespace) -> int:
     if compared and same_call:
         plain = _plain_report(X, robust, estimate.F, estimate.mask)
     elif compared:
-        plain = _plain_report(plain_X, robust, *results["plain cv2"])
+        plain = _plain_report(X, robust, *results["plain cv2"])
     if options.plot is not None and estimate.F is not None and len(estimate.F) > 3:
         raise InputError("seven matches fit several matrices, and --plot draws the lines of one")
     report = {
@@ -408,13 +416,15 @@ def _run_match(options: argparse.Namespace) -> int:
         "threshold": options.threshold,
         **_report(X, robust, estimate, plain, timings),
     }
-    print(json.dumps(report, allow_nan=False) if options.json else _for_people(report))
+    _say(json.dumps(report, allow_nan=False) if options.json else _for_people(report))
     if report["F"] is None:
         reason = "cv2's numbers are not finite" if estimate else estimate.reason
         if n_finite < _MIN_MATCHES:
             source = options.points or " and ".join(options.images)
             finite = "" if n_finite == len(X) else "finite "
             reason = f"{source}: {n_finite} {finite}matches, at least {_MIN_MATCHES} are needed"
+        if bare:
+            reason = f"no features in {' and '.join(dict.fromkeys(bare))}"
         return _complain(f"no fundamental matrix found: {reason}", NOT_FOUND)
     if options.output is not None:
         _write(options.output, X, scores, estimate, report)
@@ -424,9 +434,10 @@ def _run_match(options: argparse.Namespace) -> int:
             _draw(options.plot, images, X, estimate, alpha if by_paper else None)
     written = [str(path) for path in (options.output, options.plot) if path is not None]
     if written and not options.json:
-        print(f"\nWritten: {', '.join(written)}")
+        _say(f"\nWritten: {', '.join(written)}")
     # Such as that a JPEG file is damaged, but was of use.
-    sys.stderr.writelines(words)
+    if sys.stderr is not None:
+        sys.stderr.writelines(words)
     return FOUND
 
 
@@ -509,7 +520,7 @@ def _median_residual(F: Floats | None, X: Floats, robust: Robust) -> float | Non
 def _for_people(report: dict[str, Any]) -> str:
     times = report["timings_ms"]
     ours = [report["n_kept"], *_result(report), f"{times['estimating']:.1f}"]
-    names = ["kept as dense", "inliers", "their coherence", "median residual, px"]
+    names = ["kept as dense", "inliers", "coherence", "median residual, px"]
     names.append("processor time, ms")
     lines = [
         f"{report['n_matches']} matches, {report['method']}, threshold {report['threshold']:g} px",
@@ -533,6 +544,13 @@ def _for_people(report: dict[str, Any]) -> str:
     for name, text in (("elapsed, ms", named), ("how", report["reason"])):
         start, indent = f"{name:<22}  ", " " * 24
         lines.append(textwrap.fill(text, 79, initial_indent=start, subsequent_indent=indent))
+    coherence = report["coherence"]
+    few = 2 * report["n_inliers"] <= report["n_matches"]
+    if coherence is not None and coherence < COHERENT and few:
+        lines += [
+            "",
+            "Images that have nothing in common have inliers of such coherence.",
+        ]
     if report["F"] is not None:
         rows_of_F = ["  " + "".join(f"{value:>18.9e}" for value in row) for row in report["F"]]
         for first in range(0, len(rows_of_F), 3):
@@ -546,7 +564,7 @@ def _result(side: dict[str, Any]) -> tuple[str, str, str]:
     coherence, residual = side["coherence"], side["median_residual"]
     return (
         str(side["n_inliers"]),
-        "-" if coherence is None else f"{coherence:.2f}",
+        "-" if coherence is None else f"{round(coherence, 2) + 0.0:.2f}",
         "-" if residual is None else f"{residual:.3f}",
     )
 
@@ -622,7 +640,7 @@ def _run_demo(options: argparse.Namespace) -> int:
         matches = match_images(pair.image1, pair.image2)
     X = matches.X
     right = np.mean(residuals(pair.F, X, "usac") <= 1)
-    print(
+    _say(
         f"Middlebury's pair 'motorcycle', the second image turned by a known homography:\n"
         f"{len(X)} SIFT matches, mutual nearest neighbours, no ratio test. Threshold 1 px.\n"
         f"An easy pair: {right:.0%} of the matches are right.\n"
@@ -630,8 +648,8 @@ def _run_demo(options: argparse.Namespace) -> int:
         f"over {_DEMO_ORDERS} orders of the matches (cv2's results depend on the order).\n"
         f"The truth is known to a tenth of a pixel: smaller errors are as good as each other.\n"
     )
-    print(f"{'':<26}{'error, px':>20}{'inliers':>10}{'processor time, ms':>20}")
-    print(f"{'':<26}{'median':>10}{'worst':>10}{'median':>10}{'median':>20}")
+    _say(f"{'':<26}{'error, px':>20}{'inliers':>10}{'processor time, ms':>20}")
+    _say(f"{'':<26}{'median':>10}{'worst':>10}{'median':>10}{'median':>20}")
     estimators = dict(_demo_estimators())
     results: dict[str, list[tuple[float, int, float]]] = {name: [] for name in estimators}
     with _stage("comparing", timings):
@@ -647,7 +665,7 @@ def _run_demo(options: argparse.Namespace) -> int:
                 results[name].append((pair.error(F), int(np.sum(mask)), elapsed))
     for name, each in results.items():
         errors, inliers, times = np.array(each).T
-        print(
+        _say(
             f"{name:<26}{np.median(errors):>10.3f}{errors.max():>10.3f}"
             f"{np.median(inliers):>10.0f}{np.median(times):>20.1f}"
         )
@@ -679,7 +697,7 @@ def _run_demo(options: argparse.Namespace) -> int:
             draw(figure.subplots())
             with replacing(options.out / f"{name}.png") as temporary:
                 figure.savefig(temporary)
-    print("\nPlots:", *(options.out / f"{name}.png" for name in drawings), sep="\n  ")
+    _say("\nPlots:", *(options.out / f"{name}.png" for name in drawings), sep="\n  ")
     return FOUND
 
 
@@ -717,26 +735,31 @@ def _run_verify(options: argparse.Namespace) -> int:
     )
     now = done.n_pairs - done.n_before
     before = f", {done.n_before} more were done before" if options.resume else ""
-    print(
+    _say(
         f"{done.n_verified} of {now} image pairs verified{before}; "
         f"{done.n_inliers} of {done.n_matches} matches are inliers"
     )
+    if done.n_few or done.n_incoherent:
+        _say(
+            f"left out: {done.n_few} with fewer than {options.min_inliers} inliers, "
+            f"{done.n_incoherent} whose inliers are incoherent"
+        )
     if options.dry_run:
-        print("dry run: nothing was written")
+        _say("dry run: nothing was written")
     for image_id1, image_id2, reason in done.failures:
         _complain(f"images {image_id1} and {image_id2}: {reason}", NOT_FOUND)
     return FOUND if done.n_verified or (done.n_before and not done.failures) else NOT_FOUND
 
 
 def _run_version(options: argparse.Namespace) -> int:
-    print(f"cv-densityf {cv_densityf.__version__}")
-    print(f"opencv {cv2.__version__}")
+    _say(f"cv-densityf {cv_densityf.__version__}")
+    _say(f"opencv {cv2.__version__}")
     for name in ("numpy", "scipy", "scikit-learn", "matplotlib", "scikit-image"):
         try:
-            print(f"{name} {metadata.version(name)}")
+            _say(f"{name} {metadata.version(name)}")
         except metadata.PackageNotFoundError:
-            print(f"{name} not installed")
-    print(f"python {platform.python_version()} on {platform.platform()}")
+            _say(f"{name} not installed")
+    _say(f"python {platform.python_version()} on {platform.platform()}")
     return FOUND
 
 

@@ -83,7 +83,10 @@ class DensityPeaksResult:
         if alpha is not None:
             if not 0 <= alpha <= 1:
                 raise ValueError(f"alpha is a share of the largest gamma, in [0, 1]; got {alpha}")
-            chosen = self.gamma >= alpha * (self.rho.max() * self.delta.max())
+            limit = alpha * (self.rho.max() * self.delta.max())
+            # It is 0 where nothing stands out, as among copies of one point.
+            nothing = limit == 0 < alpha
+            chosen = self.predecessor < 0 if nothing else self.gamma >= limit
             return np.asarray(order[chosen[order]])
         if not (isinstance(n, Integral) and 1 <= n <= len(order)):
             raise ValueError(

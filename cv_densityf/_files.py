@@ -54,8 +54,8 @@ def read_matches(
         ``.npz``: arrays ``points1`` and ``points2`` (or ``pts1`` and ``pts2``), each (n, 2) in
         pixels, and optionally ``scores`` (or ``score``), (n,) or (n, 1); pickled objects are
         refused.
-        ``.csv``: comma-separated columns x, y, x', y' and optionally a score; one header row is
-        allowed. Up to ten million matches are read.
+        ``.csv``: comma-separated columns x, y, x', y' and optionally a score; one header row of
+        these names is allowed. Up to ten million matches are read.
 
     Returns
     -------
@@ -145,6 +145,8 @@ def _read_csv(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | No
     rows = _csv_rows(path)
     first = next(rows, None)
     if first is not None and not all(map(_is_number, first[1][0].split())):
+        # As numpy's savetxt writes it.
+        first[1][0] = first[1][0].removeprefix("#").strip()
         _check_header(first[1])
         first = next(rows, None)
     if first is None:

@@ -44,12 +44,18 @@ def resolve(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Call | None:
     The point arrays and the mask are not looked at: they do not decide the overload, except that a
     sixth positional argument which is no integer is a mask and not ``maxIters``.
     """
-    bound = _bind(WITH_MAX_ITERS, 6, args, kwargs)
-    if bound is not None:
-        method = _as_int(bound["method"], 0)
-        threshold = _as_float(bound["ransacReprojThreshold"], 0.0)
-        confidence = _as_float(bound["confidence"], 0.0)
-        max_iters = _as_int(bound["maxIters"], 0)
+    # The second one has defaults, which stand for None as well.
+    for names, n_required, if_none in (
+        (WITH_MAX_ITERS, 6, (0, 0.0, 0.0, 0)),
+        (WITH_DEFAULTS, 2, (cv2.FM_RANSAC, 3.0, 0.99, 1000)),
+    ):
+        bound = _bind(names, n_required, args, kwargs)
+        if bound is None:
+            continue
+        method = _as_int(bound.get("method"), if_none[0])
+        threshold = _as_float(bound.get("ransacReprojThreshold"), if_none[1])
+        confidence = _as_float(bound.get("confidence"), if_none[2])
+        max_iters = _as_int(bound.get("maxIters"), if_none[3])
         if not (method is None or threshold is None or confidence is None or max_iters is None):
             return Call(
                 bound["points1"],
@@ -58,22 +64,6 @@ def resolve(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Call | None:
                 threshold,
                 confidence,
                 max_iters,
-                None,
-                bound.get("mask"),
-            )
-    bound = _bind(WITH_DEFAULTS, 2, args, kwargs)
-    if bound is not None:
-        method = _as_int(bound.get("method"), cv2.FM_RANSAC)
-        threshold = _as_float(bound.get("ransacReprojThreshold"), 3.0)
-        confidence = _as_float(bound.get("confidence"), 0.99)
-        if not (method is None or threshold is None or confidence is None):
-            return Call(
-                bound["points1"],
-                bound["points2"],
-                method,
-                threshold,
-                confidence,
-                1000,
                 None,
                 bound.get("mask"),
             )

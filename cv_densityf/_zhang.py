@@ -138,5 +138,6 @@ def _matrix(F: ArrayLike, name: str) -> Floats:
 def _size(size: Sequence[float], name: str) -> Floats:
     array = np.asarray(size, dtype=np.float64)
     if array.shape != (2,) or not ((array > 0) & np.isfinite(array)).all():
-        raise ValueError(f"{name} is {size!r}; it must be (width, height), pixels, above 0")
+        given = size if array.size <= 4 else f"of shape {array.shape}"
+        raise ValueError(f"{name} is {given}; it must be (width, height), pixels, above 0")
     return array

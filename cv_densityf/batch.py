@@ -185,11 +185,12 @@ def _with_losses_told(backend: Any) -> Any:
 def _one(pair: Pair, options: dict[str, Any]) -> Estimate:
     """Estimate one pair; whatever goes wrong is its own result."""
     try:
-        points1, points2, *scores = pair
-        if len(scores) > 1:
+        if not (isinstance(pair, Sized) and 2 <= len(pair) <= 3):
+            items = f"{len(pair)} items" if isinstance(pair, Sized) else repr(pair)
             raise ValueError(
-                f"a pair is (points1, points2) or (points1, points2, scores), not {len(pair)} items"
+                f"a pair is (points1, points2) or (points1, points2, scores), not {items}"
             )
+        points1, points2, *scores = pair
         return estimate_fundamental(
             points1, points2, scores=scores[0] if scores else None, **options
         )

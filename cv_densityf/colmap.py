@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -51,6 +52,8 @@ class Verification:
         Of these, pairs that were verified before and left alone (``resume``).
     n_verified : int
         Pairs now found to overlap: with a fundamental matrix and enough, coherent inliers.
+    n_few, n_incoherent : int
+        Pairs left out: with no fundamental matrix or too few inliers, and with incoherent ones.
     n_matches, n_inliers : int
         Matches looked at now, and inliers among them.
     failures : tuple of (int, int, str)
@@ -60,6 +63,8 @@ class Verification:
     n_pairs: int
     n_before: int
     n_verified: int
+    n_few: int
+    n_incoherent: int
     n_matches: int
     n_inliers: int
     failures: tuple[tuple[int, int, str], ...]
@@ -149,7 +154,8 @@ def verify_matches(
             )
         ]
         keypoints = lru_cache(_CACHED_IMAGES)(lambda image_id: _keypoints(connection, image_id))
-        verified = n_matches = n_inliers = 0
+        verdicts: Counter[str] = Counter()
+        n_matches = n_inliers = 0
         failures = []
         with progress_bar(len(todo), progress) as update:
             for start in range(0, len(todo), _CHUNK):
@@ -172,16 +178,23 @@ def verify_matches(
                     if estimate.engine == "none":
                         failures.append((*_image_ids(pair_id), estimate.reason))
                         continue
-                    overlap = _overlap(points, estimate, min_inliers, min_coherence)
-                    row = _row(pair_id, matches, estimate, overlap)
-                    verified += row[-2] == UNCALIBRATED
+                    verdict = _verdict(points, estimate, min_inliers, min_coherence)
+                    verdicts[verdict] += 1
+                    row = _row(pair_id, matches, estimate if verdict == _VERIFIED else None)
                     n_inliers += row[1]
                     rows.append(row)
                 if not dry_run:
                     replace = start == 0 and not resume
                     _write(connection, rows, replace)
     return Verification(
-        n_pairs, n_pairs - len(todo), verified, n_matches, n_inliers, tuple(failures)
+        n_pairs=n_pairs,
+        n_before=n_pairs - len(todo),
+        n_verified=verdicts[_VERIFIED],
+        n_few=verdicts[_FEW],
+        n_incoherent=verdicts[_INCOHERENT],
+        n_matches=n_matches,
+        n_inliers=n_inliers,
+        failures=tuple(failures),
     )
 
 
@@ -235,7 +248,7 @@ def _check(connection: sqlite3.Connection) -> int:
     for table, width in (("matches", "cols = 2"), ("keypoints", "cols >= 2")):
         (odd,) = connection.execute(
             f"SELECT count(*) FROM {table} "
-            f"WHERE rows > 0 AND NOT ({width} AND 4 * rows * cols = length(data))"
+            f"WHERE rows > 0 AND NOT ({width} AND 4 * rows * cols = coalesce(length(data), 0))"
         ).fetchone()
         if odd:
             raise InputError(f"damaged: {odd} entries of {table} have the wrong size")
@@ -278,28 +291,33 @@ def _image_ids(pair_id: int) -> tuple[int, int]:
     return divmod(pair_id, _PAIR_BASE)
 
 
-def _overlap(
+_VERIFIED, _FEW, _INCOHERENT = "verified", "few inliers", "incoherent"
+
+
+def _verdict(
     points: tuple[NDArray[np.float32], NDArray[np.float32]],
     estimate: Estimate,
     min_inliers: int,
     min_coherence: float,
-) -> bool:
-    """Whether the inliers are enough, and most of the matches or coherent."""
+) -> str:
+    """Whether there is one F with enough inliers, and these are most of the matches or coherent."""
     n = estimate.n_inliers
-    if n < min_inliers:
-        return False
-    return 2 * n > len(estimate.mask) or coherence(*points, estimate.mask) >= min_coherence
+    if estimate.F is None or estimate.F.shape != (3, 3) or n < min_inliers:
+        return _FEW
+    most = 2 * n > len(estimate.mask)
+    coherent = most or coherence(*points, estimate.mask) >= min_coherence
+    return _VERIFIED if coherent else _INCOHERENT
 
 
 def _row(
-    pair_id: int, matches: Indices, estimate: Estimate, overlap: bool
+    pair_id: int, matches: Indices, verified: Estimate | None
 ) -> tuple[int, int, bytes | None, int, bytes | None]:
     """Give pair_id, rows, data, config and F as the table of two-view geometries has them."""
-    F = estimate.F
-    if F is None or F.shape != (3, 3) or not overlap:
+    if verified is None:
         return pair_id, 0, None, DEGENERATE, None
-    inliers = np.ascontiguousarray(matches[estimate.mask])
-    return pair_id, len(inliers), inliers.tobytes(), UNCALIBRATED, F.astype(np.float64).tobytes()
+    inliers = np.ascontiguousarray(matches[verified.mask])
+    F = np.asarray(verified.F, dtype=np.float64)
+    return pair_id, len(inliers), inliers.tobytes(), UNCALIBRATED, F.tobytes()
 
 
 def _write(connection: sqlite3.Connection, rows: list[Any], replace: bool) -> None:

@@ -297,8 +297,7 @@ def find(
     X = as_matches(points1, points2, n, usac)
     robust = Robust(
         call.method,
-        # cv2's LMEDS makes its own threshold: no caller's number may change the result.
-        3.0 if call.method == cv2.FM_LMEDS else call.threshold,
+        call.threshold,
         call.confidence,
         call.max_iters,
         call.params,

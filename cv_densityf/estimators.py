@@ -587,8 +587,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
                 self.prefilter_ = clone(self.prefilter, safe=False)
                 answer = self.prefilter_.fit_predict(matches, **prefilter_params)
                 candidates = _enough(_as_mask(answer, len(matches)))
-            F, candidates = _plain_estimate(matches, candidates, robust)
-            reason = "cv2's own call" if F is not None else "cv2 found none"
+            F, candidates, reason = _plain_estimate(matches, candidates, robust)
         if F is None or not np.isfinite(F).all():
             raise ValueError(
                 f"no fundamental matrix was found from {len(matches)} matches ({reason}); try a "
@@ -791,11 +790,14 @@ def _as_mask(answer: ArrayLike, n: int) -> NDArray[np.bool_]:
 
 def _plain_estimate(
     matches: NDArray[np.float64], candidates: NDArray[np.bool_], robust: Robust
-) -> tuple[NDArray[np.float64] | None, NDArray[np.bool_]]:
-    """Call cv2 on the candidates, and on all rows where that fails; F and the rows it is from."""
+) -> tuple[NDArray[np.float64] | None, NDArray[np.bool_], str]:
+    """Call cv2 on the candidates, and on all rows where that fails.
+
+    Returns F, the rows it is from, and the reason.
+    """
     drawn = matches[candidates]
-    F, _ = robust.plain(drawn[:, :2], drawn[:, 2:])
-    if F is None and not candidates.all():
+    estimate = run(drawn, robust, density="off")
+    if estimate.F is None and not candidates.all():
         warnings.warn(
             f"no fundamental matrix from the {len(drawn)} rows that the prefilter kept: all "
             f"{len(matches)} are used",
@@ -803,4 +805,4 @@ def _plain_estimate(
             stacklevel=3,
         )
         return _plain_estimate(matches, np.ones_like(candidates), robust)
-    return F, candidates
+    return estimate.F, candidates, estimate.reason

@@ -401,6 +401,8 @@ def _finite(X: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 def _mask(values: ArrayLike, n: int, name: str) -> NDArray[np.bool_]:
     mask = np.asarray(values).astype(bool)
+    if mask.shape == (n, 1):  # cv2's
+        mask = mask[:, 0]
     if mask.shape != (n,):
         raise ValueError(f"{name} must have the shape ({n},), not {mask.shape}")
     return mask

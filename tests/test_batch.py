@@ -86,6 +86,7 @@ def test_a_bad_pair_fails_alone(pairs, n_jobs):
         ("left.jpg", "right.jpg"),
         (points1, points2, np.ones(len(points1)), "surplus"),
         None,
+        7,
     ]
     found = list(estimate_many([pairs[0], *bad, pairs[2]], n_jobs=n_jobs))
     assert [bool(estimate) for estimate in found] == [True, *[False] * len(bad), True]
@@ -95,6 +96,8 @@ def test_a_bad_pair_fails_alone(pairs, n_jobs):
     assert found[2].mask.shape == found[2].kept.shape == (3,)
     assert not any(np.shares_memory(estimate.mask, estimate.kept) for estimate in found)
     assert all(estimate.n_inliers == 0 and estimate.reason for estimate in found[1:-1])
+    for estimate, items in zip(found[-4:-1], ("4 items", "None", "7"), strict=True):
+        assert estimate.reason.endswith(f"(points1, points2, scores), not {items}")
 
 
 def test_a_pair_that_kills_its_worker_is_named_and_the_rest_goes_on(pairs):

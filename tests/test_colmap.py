@@ -172,12 +172,19 @@ def test_dry_run_leaves_alone_what_a_killed_program_has_left(database):
     assert after == before
 
 
+def test_keypoints_without_data_are_damage(database):
+    sql(database, "UPDATE keypoints SET data = NULL WHERE image_id = 1")
+    with pytest.raises(InputError, match="1 entries of keypoints have the wrong size"):
+        verify_matches(database)
+
+
 def test_dry_run_changes_nothing(database, capsys):
     before = folder_of(database)
     many = ["--min-inliers", "50"]
     assert main(["verify", str(database), "--dry-run", "--jobs", "1", *many]) == 0
     out = capsys.readouterr().out
     assert out.startswith("3 of 4 image pairs verified; ")
+    assert "left out: 1 with fewer than 50 inliers, 0 whose inliers are incoherent" in out
     assert "nothing was written" in out
     assert folder_of(database) == before
 
@@ -200,7 +207,8 @@ def test_incoherent_inliers_do_not_verify_a_pair(database, made):
     assert verify_matches(database, min_coherence=-1.0).n_verified == 4
     # Where most matches are inliers nobody asks.
     assert main(["verify", str(database), "--min-coherence", "1"]) == 0
-    assert verify_matches(database, min_coherence=1.0).n_verified == 3
+    done = verify_matches(database, min_coherence=1.0)
+    assert (done.n_verified, done.n_few, done.n_incoherent) == (3, 0, 1)
     with pytest.raises(ValueError, match="min_coherence is nan"):
         verify_matches(database, min_coherence=np.nan)
 

@@ -325,6 +325,17 @@ def test_the_largest_alpha_leaves_the_densest():
     assert peaks.centers(alpha=1).tolist() == [1]
 
 
+@pytest.mark.parametrize("alpha", [0.011, 0.9, 1.0])
+def test_where_nothing_stands_out_there_is_one_centre(alpha):
+    """Copies of one point, and points all out of each other's reach."""
+    for peaks in (density_peaks(np.ones((30, 4))), density_peaks(np.eye(30), dc=1e-3)):
+        centers = peaks.centers(alpha=alpha)
+        assert len(centers) == 1
+        assert peaks.predecessor[centers[0]] == -1
+        assert (peaks.labels(centers) == 0).all()
+        assert len(peaks.centers(alpha=0)) == 30
+
+
 @pytest.mark.parametrize(
     "options", [{}, {"alpha": 0.1, "n": 2}, {"alpha": 1.1}, {"n": 0}, {"n": 6}, {"n": 2.5}]
 )

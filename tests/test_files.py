@@ -258,7 +258,7 @@ class TestCsv:
             st.tuples(st.integers(1, 9), st.sampled_from([4, 5])),
             elements=st.floats(allow_infinity=True, allow_nan=True),
         ),
-        header=st.sampled_from(["", "x,y,x',y'", "x1,y1,x2,y2", "X, Y, U, V"]),
+        header=st.sampled_from(["", "x,y,x',y'", "# x1,y1,x2,y2", "X, Y, U, V"]),
         end=st.sampled_from(["\n", "\r\n"]),
     )
     def test_what_is_written_is_read(self, tmp_path_factory, table, header, end):

@@ -149,6 +149,13 @@ class TestMatches:
         expected = np.stack([shown[:60:3], shown[60::3]], axis=1)
         np.testing.assert_allclose(np.array(lines.get_segments()), expected)
 
+    def test_cv2s_mask_will_do(self, ax):
+        mask = (np.arange(60) < 20).astype(np.uint8)[:, None]
+        plot_matches(None, None, SCENE.X, mask=mask, ax=ax)
+        other = Figure().subplots()
+        plot_matches(None, None, SCENE.X, mask=mask[:, 0] > 0, ax=other)
+        assert drawn(ax) == drawn(other)
+
     def test_images_need_not_be_given(self, ax):
         plot_matches(None, None, SCENE.X, ax=ax)
         assert drawn(ax) == {"kept (60)": 120}
