@@ -23,7 +23,10 @@ def load(name: str) -> Callable[..., Any]:
         raise ValueError(f"COMPAT_IMPLEMENTATION must read module:function, not {name!r}")
     if module == "cv2" and function == "findFundamentalMat":
         return reference
-    return getattr(importlib.import_module(module), function)
+    try:
+        return getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"COMPAT_IMPLEMENTATION is {name!r}: {error}") from error
 
 
 under_test = load(NAME)

@@ -313,7 +313,7 @@ def eight_point(samples: Floats) -> NDArray[np.float64]:
 def polish(
     frame: Frame,
     G: Floats,
-    scales: Sequence[float | Floats],
+    scales: Sequence[float],
     samples: NDArray[np.bool_] | None = None,
 ) -> Floats:
     """Step from fundamental matrices towards the least squares of all matches near their lines.
@@ -327,11 +327,11 @@ def polish(
         The matches.
     G : array, shape (m, 3, 3)
         Starting matrices in the frame.
-    scales : sequence of float or of arrays of shape (m,)
+    scales : sequence of float
         Width of the weights in pixels, step by step.
     samples : array, shape (k, n), bool, optional
-        The matches that the first step is restricted to, for each matrix: k is m, or m is 1 and k
-        matrices come of the same one. An infinite scale gives them all the same weight.
+        The matches that the first step is restricted to: k matrices come of one. An infinite scale
+        gives them all the same weight.
 
     Returns
     -------
@@ -340,8 +340,7 @@ def polish(
     """
     for scale in scales:
         at = _Linearized(frame, G)
-        width = np.asarray(scale, dtype=float).reshape(-1, 1) * frame.scale
-        weight = 1.0 / (1.0 + at.squared / width**2)
+        weight = 1.0 / (1.0 + at.squared / (scale * frame.scale) ** 2)
         weight *= weight
         if samples is not None:
             weight, samples = weight * samples, None

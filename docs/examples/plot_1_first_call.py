@@ -77,4 +77,5 @@ print(estimate.reason)
 
 fig, ax = plt.subplots(figsize=(12, 4.6), layout="constrained")
 plot_matches(pair.image1, pair.image2, matches.X, estimate.kept, estimate.mask, ax=ax)
+plt.show()
 # sphinx_gallery_thumbnail_number = 2

@@ -86,6 +86,7 @@ for ax, share in zip(axes, shares, strict=True):
     ax.spines[["top", "right"]].set_visible(False)
 axes[0].set(yticks=range(len(ways)), yticklabels=ways, ylim=(-0.5, len(ways) - 0.5))
 axes[0].invert_yaxis()
+plt.show()
 # sphinx_gallery_thumbnail_number = 2
 
 # %%

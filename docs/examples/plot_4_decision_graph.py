@@ -51,3 +51,4 @@ distance = np.abs((lines * np.c_[matches.points2, np.ones(len(matches))]).sum(ax
 fig, ax = plt.subplots(figsize=(10, 5.2))
 plot_decision_graph(density_peaks(matches.X), alpha=0.011, mask=distance < 1, ax=ax)
 ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3, frameon=False)
+plt.show()

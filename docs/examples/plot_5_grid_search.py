@@ -71,6 +71,7 @@ for ax, (title, values) in zip(axes, tables.items(), strict=True):
     ax.set(yticks=range(shape[0]), yticklabels=grid["prefilter__keep"])
 axes[0].set_ylabel("share of matches kept")
 fig.colorbar(mesh, ax=axes, label="mean F1 of the inliers", shrink=0.9)
+plt.show()
 
 # %%
 # ``prefilter="auto"``, the default, has no share to be chosen. On the same pairs, with the

@@ -68,6 +68,7 @@ axes[1].set(xscale="log", xticks=[10, 20, 50, 100, 200])
 axes[1].xaxis.set_major_formatter("{x:g}")
 axes[1].xaxis.set_minor_formatter("")
 fig.colorbar(dots, label="right matches, per cent")
+plt.show()
 
 # %%
 # With ``n_jobs=-1`` all cores work; the results are the same for any number. What a million pairs

@@ -45,3 +45,4 @@ for ax, images, title in zip(axes, (before, after), ("before", "after"), strict=
     for row, color in zip(range(60, size[1], 95), ["#E69F00", "#56B4E9"] * 3, strict=False):
         ax.axhline(row, color=color, lw=1.2)
     ax.set(title=title, xticks=[], yticks=[])
+plt.show()
