@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
+import numpy as np
 
 from cv_densityf import cv2_api
 from cv_densityf._engine import CV2S_OWN, original
@@ -40,9 +42,10 @@ class CallSite:
         Calls that raised.
     no_model : int
         Calls that found no fundamental matrix; all of them are passed on, too.
-    kept, dropped : int
-        Matches of the dense part, and the rest, over all calls not passed on. Of a call with more
-        than a thousand matches, those whose density was not looked at are among the rest.
+    matches, inliers : int
+        Over all calls that found a fundamental matrix and answered with an array for a mask.
+    seconds : float
+        Over all calls, by the clock.
     """
 
     filename: str
@@ -51,8 +54,9 @@ class CallSite:
     passed_on: int = 0
     errors: int = 0
     no_model: int = 0
-    kept: int = 0
-    dropped: int = 0
+    matches: int = 0
+    inliers: int = 0
+    seconds: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,16 +93,24 @@ def findFundamentalMat(*args: Any, **kwargs: Any) -> Any:
     for name in ("density", "alpha", "dc_percent", "scores"):
         if name in kwargs:
             options[name] = kwargs.pop(name)
+    start = time.perf_counter()
     try:
         answer, estimate = cv2_api.find(args, kwargs, **options)
     except BaseException:
-        _count(site, errors=1)
+        _count(site, errors=1, seconds=time.perf_counter() - start)
         raise
-    if estimate is None or estimate.engine != "density":
-        _count(site, passed_on=1, no_model=int(answer[0] is None))
-    else:
-        kept = int(estimate.kept.sum())
-        _count(site, kept=kept, dropped=len(estimate.kept) - kept)
+    seconds = time.perf_counter() - start
+    F, mask = answer
+    passed_on = estimate is None or estimate.engine != "density"
+    told = F is not None and isinstance(mask, np.ndarray)
+    _count(
+        site,
+        passed_on=int(passed_on),
+        no_model=int(F is None),
+        matches=mask.size if told else 0,
+        inliers=int(np.count_nonzero(mask)) if told else 0,
+        seconds=seconds,
+    )
     return answer
 
 
@@ -106,7 +118,7 @@ findFundamentalMat.__doc__ = cv2_api.findFundamentalMat.__doc__
 setattr(findFundamentalMat, CV2S_OWN, original)
 
 
-def _count(site: tuple[str, int], **more: int) -> None:
+def _count(site: tuple[str, int], **more: float) -> None:
     with _lock:
         old = _sites.get(site) or CallSite(*site)
         new = {name: getattr(old, name) + n for name, n in more.items()}
@@ -248,7 +260,7 @@ def call_sites() -> list[CallSite]:
     >>> with patched():
     ...     for _ in range(3):
     ...         F, mask = cv2.findFundamentalMat(scene.points1, scene.points2)
-    >>> [(site.calls, site.passed_on, site.kept + site.dropped) for site in call_sites()]
+    >>> [(site.calls, site.passed_on, site.matches) for site in call_sites()]
     [(3, 0, 600)]
     """
     with _lock:

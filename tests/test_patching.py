@@ -181,13 +181,14 @@ def test_counts_per_calling_line():
     assert {site.filename for site in sites} == {__file__}
     first, eight_point, nan, line, refused = sorted(sites, key=lambda site: site.line)
     assert (first.passed_on, first.no_model, first.errors) == (0, 0, 0)
-    assert first.kept + first.dropped == 600
-    assert 0 < first.kept < 600
-    assert (eight_point.passed_on, eight_point.kept) == (1, 0)
-    assert (nan.passed_on, nan.no_model, nan.dropped) == (1, 1, 0)
+    inliers = np.count_nonzero(findFundamentalMat(P1, P2, 36)[1])
+    assert (first.matches, first.inliers) == (600, 3 * inliers)
+    assert (eight_point.passed_on, eight_point.matches, eight_point.inliers) == (1, 200, 200)
+    assert (nan.passed_on, nan.no_model, nan.matches) == (1, 1, 0)
     # Not at once: the pipeline looks at these, and leaves them to cv2.
-    assert (line.passed_on, line.errors, line.kept, line.dropped) == (1, 0, 0, 0)
-    assert (refused.passed_on, refused.errors) == (0, 1)
+    assert (line.passed_on, line.errors) == (1, 0)
+    assert (refused.passed_on, refused.errors, refused.matches) == (0, 1, 0)
+    assert all(site.seconds > 0 for site in sites)
     reset_call_sites()
     assert call_sites() == []
 
