@@ -96,7 +96,8 @@ class DecisionGraphDisplay:
         ax = _axes(ax, (6.4, 4.8))
         rho, delta = np.asarray(self.rho, dtype=float), np.asarray(self.delta, dtype=float)
         is_center = np.zeros(len(rho), dtype=bool)
-        is_center[np.asarray([] if self.centers is None else self.centers, dtype=int)] = True
+        centers = np.asarray([] if self.centers is None else self.centers)
+        is_center[centers if centers.dtype == bool else centers.astype(int)] = True
         for name, rows, style in (
             ("points", ~is_center, {"color": "#0072B2", "marker": "o", "s": 12}),
             ("centers", is_center, {"color": "#D55E00", "marker": "^", "s": 60}),
@@ -166,7 +167,7 @@ class DecisionGraphDisplay:
         ----------
         rho, delta : array_like of float, shape (n,)
             Local density, and distance to the nearest denser point.
-        centers : array_like of int, shape (k,), optional
+        centers : array_like of int, shape (k,), or of bool, shape (n,), optional
             Rows of the cluster centres, drawn apart.
         alpha : float, optional
             Draw the curve ``rho * delta = alpha * max(rho) * max(delta)``.

@@ -96,7 +96,8 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[Any]:
     if os.path.getsize(path) > _MAX_BYTES:
         raise InputError(f"{os.fspath(path)}: larger than the 2 GB that OpenCV can decode")
     # Not cv2.imread: it writes its own warnings, and cannot tell a missing file from a bad one.
-    data = np.fromfile(path, dtype=np.uint8)
+    with open(path, "rb") as stream:  # which may be a pipe
+        data = np.frombuffer(stream.read(), dtype=np.uint8)
     try:
         image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
     except cv2.error:

@@ -592,6 +592,15 @@ def test_decision_graph_display(scene):
     )
     assert len(arrays.ax_.collections) == 1
     assert not arrays.ax_.lines
+    graphs = [
+        DecisionGraphDisplay.from_arrays(
+            clusterer.rho_, clusterer.delta_, centers=rows, ax=Figure().subplots()
+        )
+        for rows in (np.array([5, 7]), np.isin(np.arange(len(clusterer.rho_)), [5, 7]))
+    ]
+    rows, marks = (graph.ax_.collections[1].get_offsets() for graph in graphs)
+    assert len(rows) == 2
+    np.testing.assert_array_equal(rows, marks)
     fixed = DensityPeaks(n_clusters=2).fit(scene.X)
     assert not DecisionGraphDisplay.from_estimator(fixed, ax=Figure().subplots()).ax_.lines
 

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import os
+from concurrent.futures import ThreadPoolExecutor
+
 import cv2
 import numpy as np
 import pytest
@@ -274,6 +277,16 @@ class TestReadImage:
         path.write_bytes(content)
         with pytest.raises(InputError, match=r"image\.png: not an image"):
             read_image(path)
+
+    @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
+    def test_a_pipe(self, tmp_path):
+        image = np.random.default_rng(0).integers(0, 255, (20, 30), dtype=np.uint8)
+        path = tmp_path / "pipe"
+        os.mkfifo(path)
+        content = cv2.imencode(".png", image)[1].tobytes()
+        with ThreadPoolExecutor(1) as writer:
+            writer.submit(path.write_bytes, content)
+            np.testing.assert_array_equal(read_image(path), image)
 
     def test_missing(self, tmp_path):
         with pytest.raises(FileNotFoundError):
