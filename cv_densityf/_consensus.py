@@ -217,14 +217,18 @@ def search(
     agreed = agreed and pool.agrees_off_plane()
     again = "found again by another" if agreed else "found by no other"
     reason = f"the hypothesis with {pool.virtue} of {n_draws} draws, {again}"
+    planar = pool.planar
     if in_vain:
         reason += (
-            ", which ended early: matches lie together only as by chance, and so do the inliers"
+            "; the search ended early: matches lie together only as by chance, and so do the "
+            "inliers"
         )
-    elif pool.planar > _PLANAR:
+    elif planar > _PLANAR:
+        # Draws that have the same inliers may have another F.
+        agreed = False
         reason += (
-            f"; {pool.planar:.0%} of its inliers suit one plane, or a camera that only turned, "
-            "which leave F open"
+            f"; {planar:.0%} of its inliers suit one plane, or a camera that only turned, which "
+            "leave F open"
         )
     return Consensus(F, reliability, tuple(pool.votes.tolist()), n_draws, agreed, reason)
 

@@ -67,8 +67,9 @@ class Estimate:
     n_draws : int
         Hypotheses drawn; 0 if cv2's own call answered.
     agreed : bool
-        Whether another draw found the same, which is hardly ever by accident. False where cv2's own
-        call answered, and for ``density="paper"``.
+        Whether another draw found the same, which is hardly ever by accident. False where nearly
+        all inliers are on one plane, which leaves F open, where cv2's own call answered, and for
+        ``density="paper"``.
     engine : str
         What drew: ``"density"``, or the name of cv2's method that was called instead.
     reason : str

@@ -781,7 +781,8 @@ def test_the_reason_tells_of_matches_that_leave_f_open(seed, wrong):
     stray = rng.uniform(0, [1280, 960] * 2, (wrong, 4))
     for X, open_ in ((plane, True), (true_matches(seed), False)):
         X = np.vstack([X + rng.normal(0, 0.3, (400, 4)), stray])
-        assert ("leave F open" in find(X).reason) == open_
+        found = find(X)
+        assert ("leave F open" in found.reason) == (not found.agreed) == open_
 
 
 def test_the_watch_tells_draws_from_the_rest(monkeypatch):
