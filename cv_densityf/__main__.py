@@ -11,7 +11,7 @@ import tempfile
 import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any, NoReturn
@@ -90,7 +90,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _complain(message: str, code: int) -> int:
     # To print into None would be to print to standard output.
     if sys.stderr is not None:
-        print(f"cv-densityf: {message}", file=sys.stderr)
+        with suppress(OSError):
+            print(f"cv-densityf: {message}", file=sys.stderr, flush=True)
     return code
 
 

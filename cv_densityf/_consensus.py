@@ -67,8 +67,10 @@ _CONTAINED = 0.9
 _SIGNIFICANT = 2.0
 #: Working thresholds within which a match is on a plane.
 _PLANE_WIDTH = 2.0
-#: With more than this share of the inliers on a plane the reason says so.
+#: With more than this share of the inliers on a plane, and no more off it than so many and this
+#: share of all that is off it, which may be by chance, the reason says so.
 _PLANAR = 0.9
+_BY_CHANCE = (8, 0.03)
 #: Draws from parts whose sizes differ by less than this factor are not independent.
 _DISTINCT = 1.4
 #: Largest size of the samples of the local optimisation, how many working thresholds from the
@@ -210,11 +212,10 @@ def search(
     pool.complete()
     if not pool.agrees(_CLOSE_AGREEMENT):
         pool.optimise(in_vain)
-        agreed = pool.agrees()
     F = pool.refined_best() if others is None else pool.before(others - centre).settled_best()
     F = shift(-centre[2:]).T @ F @ shift(-centre[:2])
     watch.lap("polish")
-    agreed = agreed and pool.agrees_off_plane()
+    agreed = pool.agrees_independently()
     again = "found again by another" if agreed else "found by no other"
     reason = f"the hypothesis with {pool.virtue} of {n_draws} draws, {again}"
     planar = pool.planar
@@ -227,8 +228,8 @@ def search(
         # Draws that have the same inliers may have another F.
         agreed = False
         reason += (
-            f"; {planar:.0%} of its inliers suit one plane, or a camera that only turned, which "
-            "leave F open"
+            f"; {planar:.0%} of its inliers suit one plane, or a camera that only turned, and the "
+            "others are no more than by chance, which leaves F open"
         )
     return Consensus(F, reliability, tuple(pool.votes.tolist()), n_draws, agreed, reason)
 
@@ -238,6 +239,7 @@ class _Part(NamedTuple):
 
     points: Floats
     iters: int
+    #: Negative where the best hypothesis so far has chosen the matches.
     size: int
     best_first: bool = False
 
@@ -274,7 +276,8 @@ def _fill(
                 continue
             share = min(max(len(part) / len(order), 0.25), 1.0)
             iters = min(max_iters, int(MAX_DRAW_ITERS * np.sqrt(0.25 / share)))
-            parts.append(_Part(part, iters, len(part), by_score))
+            size = -len(part) if fraction == NEAR else len(part)
+            parts.append(_Part(part, iters, size, by_score))
         _draw(pool, parts, confidence, seed + n_draws, watch)
         n_draws += len(parts)
         agreed = pool.agrees()
@@ -459,9 +462,13 @@ class _Pool:
 
     @property
     def planar(self) -> float:
-        """Share of the best hypothesis's inliers that are on one plane."""
+        """Share of the best hypothesis's inliers on a plane; 0 if it is not the plane's alone."""
         planar = self._planar[self.near_best(1.0)]
-        return float(planar.mean()) if len(planar) > FEWEST else 0.0
+        n_off = len(planar) - np.count_nonzero(planar)
+        few, share = _BY_CHANCE
+        if len(planar) < FEWEST or n_off > few + share * np.count_nonzero(~self._planar):
+            return 0.0
+        return float(planar.mean())
 
     @property
     def virtue(self) -> str:
@@ -470,17 +477,27 @@ class _Pool:
             return "the most votes"
         return "the most inliers off a dominant plane"
 
-    def agrees_off_plane(self) -> bool:
-        """Whether the draws that agree do so off a dominant plane, if there is one."""
-        return self._off_plane is None or self.agrees(among=self._off_plane)
+    def agrees_independently(self) -> bool:
+        """Whether draws that no hypothesis had a say in agree, off a dominant plane as well."""
+        sizes = np.maximum(self._sizes, 0)
+        off_plane = self._off_plane
+        return self.agrees(sizes=sizes) and (
+            off_plane is None or self.agrees(sizes=sizes, among=off_plane)
+        )
 
-    def agrees(self, overlap: float = _AGREEMENT, among: Bools | None = None) -> bool:
+    def agrees(
+        self,
+        overlap: float = _AGREEMENT,
+        among: Bools | None = None,
+        sizes: Floats | None = None,
+    ) -> bool:
         """Whether draws from two different parts have the best hypothesis's inliers."""
         if len(self) < 2:
             return False
         inliers = self._inliers if among is None else self._inliers[:, among]
         alike = _alike(inliers, inliers[self.best], overlap)
-        sizes = self._sizes[alike & (self._sizes > 0)]
+        sizes = np.abs(self._sizes) if sizes is None else sizes
+        sizes = sizes[alike & (sizes > 0)]
         return len(sizes) > 1 and bool(sizes.max() >= _DISTINCT * sizes.min())
 
     def refined_best(self) -> NDArray[np.float64]:

@@ -185,12 +185,13 @@ def _with_losses_told(backend: Any) -> Any:
 def _one(pair: Pair, options: dict[str, Any]) -> Estimate:
     """Estimate one pair; whatever goes wrong is its own result."""
     try:
-        if not (isinstance(pair, Sized) and 2 <= len(pair) <= 3):
-            items = f"{len(pair)} items" if isinstance(pair, Sized) else repr(pair)
+        items = tuple(pair) if isinstance(pair, Iterable) else None
+        if items is None or not 2 <= len(items) <= 3:
+            given = repr(pair) if items is None else f"{len(items)} items"
             raise ValueError(
-                f"a pair is (points1, points2) or (points1, points2, scores), not {items}"
+                f"a pair is (points1, points2) or (points1, points2, scores), not {given}"
             )
-        points1, points2, *scores = pair
+        points1, points2, *scores = items
         return estimate_fundamental(
             points1, points2, scores=scores[0] if scores else None, **options
         )
