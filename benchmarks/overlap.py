@@ -15,11 +15,11 @@ from tqdm import tqdm
 
 from benchmarks.data import Pair, load_pairs
 from benchmarks.metrics import LOST
-from benchmarks.paper import CUTS, MUTUAL, ONE_WAY, RATIO, Views, real_pairs, rendered_pairs
+from benchmarks.paper import CUTS, Views, real_pairs, rendered_pairs
 from benchmarks.report import _table
 from cv_densityf import coherence, estimate_fundamental
 from cv_densityf._prefilter import COHERENT
-from cv_densityf.matching import Features, Matches, detect, match_features
+from cv_densityf.matching import detect, match_features
 
 Floats = NDArray[np.float64]
 
@@ -75,15 +75,10 @@ def _candidates(views: Sequence[Views], more: Sequence[Views]) -> dict[str, Cand
     return {
         cut: Candidates(
             [(X, v) for v in [*views, *more] if (X := v.matches(cut)) is not None],
-            [_match(cut, *pair).X for pair in strangers],
+            [match_features(*pair, **how).X for pair in strangers],
         )
-        for cut in tqdm(CUTS, desc="match", unit="kind")
+        for cut, how in tqdm(CUTS.items(), desc="match", unit="kind")
     }
-
-
-def _match(cut: str, first: Features, second: Features) -> Matches:
-    ratio = None if cut in (ONE_WAY, MUTUAL) else RATIO
-    return match_features(first, second, ratio=ratio, mutual=cut != ONE_WAY)
 
 
 def _section(candidates: Mapping[str, Candidates], threshold: float) -> str:

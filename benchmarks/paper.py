@@ -46,7 +46,12 @@ N_PAPER, N_LEAST = 411, 200
 #: What is drawn from: the nearest neighbours of the first image's features, those of them that are
 #: mutual, and those of these that pass a ratio test. The paper does not say how it matched.
 ONE_WAY, MUTUAL, RATIO = "one-way matches", "mutual matches", 0.8
-CUTS = (ONE_WAY, MUTUAL, f"SIFT ratio < {RATIO}")
+#: With what `match_features` is told.
+CUTS: dict[str, dict[str, Any]] = {
+    ONE_WAY: {"mutual": False},
+    MUTUAL: {},
+    f"SIFT ratio < {RATIO}": {"ratio": RATIO},
+}
 #: The paper names neither.
 CONFIDENCE, MAX_ITERS = 0.999, 5000
 DC_PERCENT = 2.0
@@ -353,7 +358,7 @@ def _photographed(name: str, image1: Any, image2: Any, F: Floats, truth: Floats 
 
 
 def _one_way(image1: Any, image2: Any) -> Floats:
-    return match_images(image1, image2, mutual=False).X
+    return match_images(image1, image2, **CUTS[ONE_WAY]).X
 
 
 def draw(X: Floats, seed: int) -> Floats:

@@ -88,11 +88,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _complain(message: str, code: int) -> int:
+    _warn(f"cv-densityf: {message}\n")
+    return code
+
+
+def _warn(text: str) -> None:
     # To print into None would be to print to standard output.
     if sys.stderr is not None:
         with suppress(OSError):
-            print(f"cv-densityf: {message}", file=sys.stderr, flush=True)
-    return code
+            print(text, end="", file=sys.stderr, flush=True)
 
 
 def _say(*words: object, sep: str = " ") -> None:
@@ -437,8 +441,7 @@ def _run_match(options: argparse.Namespace) -> int:
     if written and not options.json:
         _say(f"\nWritten: {', '.join(written)}")
     # Such as that a JPEG file is damaged, but was of use.
-    if sys.stderr is not None:
-        sys.stderr.writelines(words)
+    _warn("".join(words))
     return FOUND
 
 
@@ -521,8 +524,7 @@ def _median_residual(F: Floats | None, X: Floats, robust: Robust) -> float | Non
 def _for_people(report: dict[str, Any]) -> str:
     times = report["timings_ms"]
     ours = [report["n_kept"], *_result(report), f"{times['estimating']:.1f}"]
-    names = ["kept as dense", "inliers", "coherence", "median residual, px"]
-    names.append("processor time, ms")
+    names = ["kept as dense", "inliers", "coherence", "median residual, px", "processor time, ms"]
     lines = [
         f"{report['n_matches']} matches, {report['method']}, threshold {report['threshold']:g} px",
         "",
@@ -548,10 +550,7 @@ def _for_people(report: dict[str, Any]) -> str:
     coherence = report["coherence"]
     few = 2 * report["n_inliers"] <= report["n_matches"]
     if coherence is not None and coherence < COHERENT and few:
-        lines += [
-            "",
-            "Images that have nothing in common have inliers of such coherence.",
-        ]
+        lines += ["", "Images that have nothing in common have inliers of such coherence."]
     if report["F"] is not None:
         rows_of_F = ["  " + "".join(f"{value:>18.9e}" for value in row) for row in report["F"]]
         for first in range(0, len(rows_of_F), 3):

@@ -218,13 +218,12 @@ def search(
     agreed = pool.agrees_independently()
     again = "found again by another" if agreed else "found by no other"
     reason = f"the hypothesis with {pool.virtue} of {n_draws} draws, {again}"
-    planar = pool.planar
     if in_vain:
         reason += (
             "; the search ended early: matches lie together only as by chance, and so do the "
             "inliers"
         )
-    elif planar > _PLANAR:
+    elif (planar := pool.planar) > _PLANAR:
         # Draws that have the same inliers may have another F.
         agreed = False
         reason += (
@@ -479,24 +478,23 @@ class _Pool:
 
     def agrees_independently(self) -> bool:
         """Whether draws that no hypothesis had a say in agree, off a dominant plane as well."""
-        sizes = np.maximum(self._sizes, 0)
         off_plane = self._off_plane
-        return self.agrees(sizes=sizes) and (
-            off_plane is None or self.agrees(sizes=sizes, among=off_plane)
+        return self.agrees(independently=True) and (
+            off_plane is None or self.agrees(among=off_plane, independently=True)
         )
 
     def agrees(
         self,
         overlap: float = _AGREEMENT,
         among: Bools | None = None,
-        sizes: Floats | None = None,
+        independently: bool = False,
     ) -> bool:
         """Whether draws from two different parts have the best hypothesis's inliers."""
         if len(self) < 2:
             return False
         inliers = self._inliers if among is None else self._inliers[:, among]
         alike = _alike(inliers, inliers[self.best], overlap)
-        sizes = np.abs(self._sizes) if sizes is None else sizes
+        sizes = self._sizes if independently else np.abs(self._sizes)
         sizes = sizes[alike & (sizes > 0)]
         return len(sizes) > 1 and bool(sizes.max() >= _DISTINCT * sizes.min())
 
@@ -565,8 +563,8 @@ def _doubt(squared: Floats, sigma: float, reliability: Floats) -> Floats:
     """
     group = np.minimum(reliability * _GROUPS, _GROUPS - 1).astype(np.intp)
 
-    def count(marked: Bools) -> Floats:
-        return np.bincount(group, marked, _GROUPS).astype(float)
+    def count(marked: Bools) -> Ints:
+        return np.bincount(group[marked], minlength=_GROUPS)
 
     first, last = _BESIDE
     beside = (squared > (first * sigma) ** 2) & (squared < (last * sigma) ** 2)

@@ -128,15 +128,10 @@ def _report() -> str:
     if not sites:
         return "cv-densityf: cv2.findFundamentalMat was not called through the patch"
     names = ("calls", "cv2's own", "errors", "no model", "matches", "inliers", "ms a call")
-    rows = [
-        (
-            *(s.calls, s.passed_on, s.errors, s.no_model, s.matches, s.inliers),
-            round(1e3 * s.seconds / s.calls, 1),
-        )
-        for s in sites
-    ]
     lines = ["cv-densityf: calls of cv2.findFundamentalMat, and their matches"]
     lines.append("".join(f"{name:>10}" for name in names) + "  line")
-    for site, row in zip(sites, rows, strict=True):
-        lines.append("".join(f"{n:>10}" for n in row) + f"  {site.filename}:{site.line}")
+    for s in sites:
+        row = (s.calls, s.passed_on, s.errors, s.no_model, s.matches, s.inliers)
+        numbers = "".join(f"{n:>10}" for n in row) + f"{1e3 * s.seconds / s.calls:>10.1f}"
+        lines.append(f"{numbers}  {s.filename}:{s.line}")
     return "\n".join(lines)

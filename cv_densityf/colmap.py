@@ -34,6 +34,8 @@ _TABLES = {"images", "keypoints", "matches", "two_view_geometries"}
 #: Pairs per transaction: what a killed run has to do again.
 _CHUNK = 256
 _CACHED_IMAGES = 512
+#: What comes of a pair.
+_VERIFIED, _FEW, _INCOHERENT = "verified", "few inliers", "incoherent"
 #: Seconds to wait for another program's lock.
 _PATIENCE = 5.0
 
@@ -289,9 +291,6 @@ def _keypoints(connection: sqlite3.Connection, image_id: int) -> NDArray[np.floa
 
 def _image_ids(pair_id: int) -> tuple[int, int]:
     return divmod(pair_id, _PAIR_BASE)
-
-
-_VERIFIED, _FEW, _INCOHERENT = "verified", "few inliers", "incoherent"
 
 
 def _verdict(
