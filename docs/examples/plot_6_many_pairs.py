@@ -61,7 +61,7 @@ for ax, x, label in zip(
     dots = ax.scatter(x, distances, c=100 * shares, cmap="viridis", s=40, ec="white", lw=0.5)
     ax.set(yscale="log", xlabel=label)
     ax.spines[["top", "right"]].set_visible(False)
-axes[0].axvspan(0.35, 0.5, color="0.9", lw=0)
+axes[0].axvspan(0.35, 0.5, color="0.9", lw=0, zorder=0)
 axes[0].set(ylabel="Zhang's distance from the true F, pixels")
 axes[0].yaxis.set_major_formatter("{x:g}")
 axes[1].set(xscale="log", xticks=[10, 20, 50, 100, 200])
