@@ -30,6 +30,7 @@ from benchmarks.report import _LOST, _finite, _table
 from benchmarks.run import one_thread
 from benchmarks.scenes import make_scene
 from cv_densityf import datasets
+from cv_densityf._arguments import DensityRule
 from cv_densityf._density import density_peaks
 from cv_densityf._engine import Robust
 from cv_densityf._estimate import run
@@ -189,7 +190,7 @@ def _robust(flag: int, threshold: float) -> Robust:
 
 def _proposed(X: Floats, threshold: float, alpha: float, seed: int) -> Solution:
     """Take steps 1 to 5 literally; the inliers are among the matches that the rule keeps."""
-    found = run(X, _robust(cv2.FM_RANSAC, threshold), density="paper", alpha=alpha, seed=seed)
+    found = run(X, _robust(cv2.FM_RANSAC, threshold), DensityRule("paper", alpha), seed=seed)
     # The pipeline leaves it to cv2, and to all matches, where no sample of the kept ones agrees.
     return Solution(usable(found.F), found.mask & found.kept, int(found.kept.sum()))
 
@@ -204,7 +205,7 @@ def _proposed_cv2(X: Floats, threshold: float, alpha: float, seed: int) -> Solut
 
 
 def _default(X: Floats, threshold: float, alpha: float, seed: int) -> Solution:
-    found = run(X, _robust(cv2.FM_RANSAC, threshold), density="contrast", seed=seed)
+    found = run(X, _robust(cv2.FM_RANSAC, threshold), seed=seed)
     return Solution(usable(found.F), found.mask, len(X))
 
 

@@ -21,16 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import cv_densityf
+from cv_densityf._arguments import DENSITIES
 from cv_densityf._density import density_peaks
 from cv_densityf._engine import GRAPH_CUT_MAX, METHODS, Robust, method_flag, short_name
 from cv_densityf._epipolar import Floats, residuals
-from cv_densityf._estimate import (
-    DENSITIES,
-    MIN_FILTERED,
-    Estimate,
-    estimate_fundamental,
-    finite_in_cv2,
-)
+from cv_densityf._estimate import MIN_FILTERED, Estimate, estimate_fundamental, finite_in_cv2
 from cv_densityf._files import InputError, read_matches, replacing
 from cv_densityf._prefilter import COHERENT
 from cv_densityf._run_script import add_run, run_script

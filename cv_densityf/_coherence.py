@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cv_densityf import _prefilter
-from cv_densityf._estimate import check_matches
+from cv_densityf._arguments import check_matches
 
 
 def coherence(points1: ArrayLike, points2: ArrayLike, mask: ArrayLike | None = None) -> float:

@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from numbers import Integral, Real
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cv_densityf._arguments import (
+    CONTRAST,
+    Density,
+    DensityRule,
+    check,
+    check_matches,
+    check_scores,
+)
 from cv_densityf._consensus import eight_point_ransac, search
 from cv_densityf._engine import Robust, method_flag, method_name
 from cv_densityf._epipolar import FAR, inlier_mask, middle
@@ -20,9 +28,6 @@ from cv_densityf._stopwatch import Stopwatch
 #: One line per estimate at level DEBUG.
 LOG = logging.getLogger("cv_densityf")
 LOG.addHandler(logging.NullHandler())
-
-Density = Literal["contrast", "paper", "off"]
-DENSITIES = get_args(Density)
 
 #: With fewer matches cv2 turns RANSAC into LMEDS, and there is no density to speak of.
 MIN_FILTERED = 15
@@ -114,15 +119,13 @@ class Estimate:
 def run(
     X: NDArray[np.float64],
     robust: Robust,
+    rule: DensityRule = CONTRAST,
     *,
-    density: str = "contrast",
-    alpha: float = 0.011,
-    dc_percent: float = 2.0,
     scores: NDArray[np.float64] | None = None,
     seed: int = 0,
 ) -> Estimate:
     """Estimate F from trusted arguments: X (n, 4) float64, whose rows may hold NaN or Inf."""
-    estimate = _estimate(X, robust, density, alpha, dc_percent, scores, seed)
+    estimate = _estimate(X, robust, rule, scores, seed)
     if LOG.isEnabledFor(logging.DEBUG):
         LOG.debug(
             "%d matches, %d kept, %d draws, %d inliers, engine %s, %.1f ms: %s",
@@ -140,14 +143,12 @@ def run(
 def _estimate(
     X: NDArray[np.float64],
     robust: Robust,
-    density: str,
-    alpha: float,
-    dc_percent: float,
+    rule: DensityRule,
     scores: NDArray[np.float64] | None,
     seed: int,
 ) -> Estimate:
     watch = Stopwatch()
-    n = len(X)
+    n, density = len(X), rule.density
     finite = finite_in_cv2(X)
     rows = np.flatnonzero(finite)
     direct = robust.params is None and robust.flag in _DIRECT
@@ -183,7 +184,7 @@ def _estimate(
     with np.errstate(all="ignore"):
         try:
             if density == "paper":
-                r, support = paper_support(Z, alpha, dc_percent)
+                r, support = paper_support(Z, rule.alpha, rule.dc_percent)
                 watch.lap("density")
                 found = eight_point_ransac(Z[support], **asked)
                 watch.lap("draws")
@@ -402,79 +403,20 @@ def estimate_fundamental(
     """
     X = check_matches(points1, points2)
     trust = None if scores is None else check_scores(scores, len(X))
-    _check(
+    check(
         "threshold", threshold, Real, lambda v: 1e-12 < v < 1e6, "a number above 1e-12, below 1e6"
     )
-    _check("confidence", confidence, Real, lambda v: 0 < v < 1, "a number inside (0, 1)")
-    _check(
+    check("confidence", confidence, Real, lambda v: 0 < v < 1, "a number inside (0, 1)")
+    check(
         "max_iters", max_iters, Integral, lambda v: 1 <= v < 2**31, "an integer from 1 to 2^31 - 1"
     )
-    check_density(density, alpha, dc_percent)
+    rule = DensityRule(density, alpha, dc_percent)
     in_range = "an integer from 0 to 2^31 - 1"
-    _check("random_state", random_state, Integral, lambda v: 0 <= v < 2**31, in_range)
+    check("random_state", random_state, Integral, lambda v: 0 <= v < 2**31, in_range)
     return run(
         X,
         Robust(method_flag(method), float(threshold), float(confidence), int(max_iters)),
-        density=density,
-        alpha=alpha,
-        dc_percent=dc_percent,
+        rule,
         scores=trust,
         seed=int(random_state),
     )
-
-
-def check_density(density: Any, alpha: Any, dc_percent: Any) -> None:
-    """Raise ValueError, with what to do, for options of the density rules out of range."""
-    _check("density", density, str, DENSITIES.__contains__, f"one of {', '.join(DENSITIES)}")
-    _check("alpha", alpha, Real, lambda v: 0 <= v <= 1, "a number from 0 to 1")
-    _check("dc_percent", dc_percent, Real, lambda v: 0 < v <= 100, "a number in (0, 100]")
-
-
-def check_matches(points1: ArrayLike, points2: ArrayLike) -> NDArray[np.float64]:
-    """Return matched points as rows x, y, x', y', (n, 4), or raise ValueError."""
-    first = _points(points1, "points1")
-    second = _points(points2, "points2")
-    if len(first) != len(second):
-        raise ValueError(
-            f"points1 has {len(first)} points and points2 {len(second)}; "
-            "row i of both must be one match"
-        )
-    return np.hstack([first, second])
-
-
-def check_scores(scores: ArrayLike, n: int | None) -> NDArray[np.float64]:
-    """Return the scores of n matches as (n,), or raise ValueError; n is None where unknown.
-
-    A column or a row will do, and so will infinities, since only the order counts.
-    """
-    trust = _real(scores, "scores")
-    if trust.ndim not in (1, 2) or trust.size not in trust.shape:
-        raise ValueError(f"scores has shape {trust.shape}; it must be (n,): one number a match")
-    if n is not None and trust.size != n:
-        raise ValueError(f"scores has {trust.size} entries for {n} matches")
-    if np.isnan(trust).any():
-        raise ValueError("scores has NaN; give matches of unknown trust the lowest score")
-    return trust.ravel()
-
-
-def _real(values: ArrayLike, name: str) -> NDArray[np.float64]:
-    array = np.asarray(values)
-    if np.iscomplexobj(array):
-        raise ValueError(f"{name} is of type {array.dtype}; it must be real numbers")
-    return np.asarray(array, dtype=np.float64)
-
-
-def _points(points: ArrayLike, name: str) -> NDArray[np.float64]:
-    array = _real(points, name)
-    if array.shape == (0,):
-        return np.empty((0, 2))
-    if array.ndim == 3 and 1 in array.shape[:2] and array.shape[2] == 2:
-        array = array.reshape(-1, 2)
-    if array.ndim != 2 or array.shape[1] != 2:
-        raise ValueError(f"{name} has shape {array.shape}; it must be (n, 2): one x, y a row")
-    return array
-
-
-def _check(name: str, value: Any, kind: type, holds: Callable[[Any], bool], wanted: str) -> None:
-    if isinstance(value, bool) or not isinstance(value, kind) or not holds(value):
-        raise ValueError(f"{name} is {value!r}; it must be {wanted}")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.lib.format import MAGIC_PREFIX
 from numpy.typing import NDArray
 
-from cv_densityf._estimate import check_scores
+from cv_densityf._arguments import check_scores
 
 #: No file is read that holds more matches: memory would not bear what follows either.
 MAX_MATCHES = 10_000_000

@@ -16,7 +16,7 @@ from runpy import _run_module_as_main  # type: ignore[attr-defined]
 from types import ModuleType
 from typing import Any
 
-from cv_densityf._estimate import DENSITIES
+from cv_densityf._arguments import DENSITIES
 from cv_densityf.patching import call_sites, patch_cv2
 
 CANNOT_OPEN = 2

@@ -12,17 +12,10 @@ import numpy as np
 from cv2.typing import MatLike
 from numpy.typing import ArrayLike, NDArray
 
+from cv_densityf._arguments import Density, DensityRule, check_scores
 from cv_densityf._engine import Robust, cuts_graph, is_usac, original, without_graph_cut
 from cv_densityf._epipolar import inlier_mask
-from cv_densityf._estimate import (
-    LOG,
-    MIN_FILTERED,
-    Density,
-    Estimate,
-    check_density,
-    check_scores,
-    run,
-)
+from cv_densityf._estimate import LOG, MIN_FILTERED, Estimate, run
 from cv_densityf._overloads import KEYWORDS, Call, resolve
 from cv_densityf._points import as_array, as_matches, as_umat, n_points
 
@@ -249,20 +242,17 @@ def findFundamentalMat(
     >>> F.shape, mask.shape, int(mask.sum())
     ((3, 3), (100, 1), 100)
     """
-    return find(args, kwargs, density, alpha, dc_percent, scores)[0]
+    return find(args, kwargs, DensityRule(density, alpha, dc_percent), scores)[0]
 
 
 def find(
     args: tuple[Any, ...],
     kwargs: dict[str, Any],
-    density: Density = "contrast",
-    alpha: float = 0.011,
-    dc_percent: float = 2.0,
+    rule: DensityRule,
     scores: ArrayLike | None = None,
 ) -> tuple[Any, Estimate | None]:
     """Answer a call of cv2's function, and say how: None where the answer is cv2's own."""
-    start = perf_counter()
-    check_density(density, alpha, dc_percent)
+    start, density = perf_counter(), rule.density
     call = resolve(args, kwargs)
     if call is None:
         try:
@@ -295,19 +285,11 @@ def find(
         if not ordinary:
             return _passed_on(_no_model(call, n, usac, slot), n, density, start)
     X = as_matches(points1, points2, n, usac)
-    robust = Robust(
-        call.method,
-        call.threshold,
-        call.confidence,
-        call.max_iters,
-        call.params,
-    )
+    robust = Robust(call.method, call.threshold, call.confidence, call.max_iters, call.params)
     estimate = run(
         X,
         robust,
-        density=density,
-        alpha=alpha,
-        dc_percent=dc_percent,
+        rule,
         scores=trust,
         seed=0 if call.params is None else call.params.randomGeneratorState,
     )

@@ -29,6 +29,7 @@ from sklearn.utils.validation import (
 )
 
 from cv_densityf import _epipolar
+from cv_densityf._arguments import OFF
 from cv_densityf._density import checked_points, density_peaks
 from cv_densityf._display import DecisionGraphDisplay
 from cv_densityf._engine import METHODS, Robust, method_flag
@@ -796,7 +797,7 @@ def _plain_estimate(
     Returns F, the rows it is from, and the reason.
     """
     drawn = matches[candidates]
-    estimate = run(drawn, robust, density="off")
+    estimate = run(drawn, robust, OFF)
     if estimate.F is None and not candidates.all():
         warnings.warn(
             f"no fundamental matrix from the {len(drawn)} rows that the prefilter kept: all "

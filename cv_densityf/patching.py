@@ -12,15 +12,15 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import cv2
 import numpy as np
 
 from cv_densityf import cv2_api
+from cv_densityf._arguments import Density, DensityRule
 from cv_densityf._engine import CV2S_OWN, original
-from cv_densityf._estimate import Density, check_density
 
 
 @dataclass(frozen=True)
@@ -59,19 +59,11 @@ class CallSite:
     seconds: float = 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class _Patch:
-    """Options of one `patch_cv2` or `patched`; compared by identity."""
-
-    density: Density
-    alpha: float
-    dc_percent: float
-
-
 _lock = threading.RLock()
-#: The last one counts. `patch_cv2` has at most one in it, every open `patched` has its own.
-_patches: list[_Patch] = []
-_lasting: _Patch | None = None
+#: The last one counts. `patch_cv2` has at most one in it, every open `patched` has its own, which
+#: is found again by identity.
+_patches: list[DensityRule] = []
+_lasting: DensityRule | None = None
 _before: Any = original
 _sites: dict[tuple[str, int], CallSite] = {}
 
@@ -79,23 +71,17 @@ _sites: dict[tuple[str, int], CallSite] = {}
 def findFundamentalMat(*args: Any, **kwargs: Any) -> Any:
     """Stand in for cv2's function as long as a patch is in force."""
     with _lock:
-        patch = _patches[-1] if _patches else None
-    if patch is None:  # somebody kept this function beyond the patch
+        rule = _patches[-1] if _patches else None
+    if rule is None:  # somebody kept this function beyond the patch
         return original(*args, **kwargs)
     caller = sys._getframe().f_back
     site = ("<no file>", 0) if caller is None else (caller.f_code.co_filename, caller.f_lineno)
     # The extras are no parameters of cv2's function, but a patched program may know of us.
-    options: dict[str, Any] = {
-        "density": patch.density,
-        "alpha": patch.alpha,
-        "dc_percent": patch.dc_percent,
-    }
-    for name in ("density", "alpha", "dc_percent", "scores"):
-        if name in kwargs:
-            options[name] = kwargs.pop(name)
+    options = {field.name: kwargs.pop(field.name) for field in fields(rule) if field.name in kwargs}
+    scores = kwargs.pop("scores", None)
     start = time.perf_counter()
     try:
-        answer, estimate = cv2_api.find(args, kwargs, **options)
+        answer, estimate = cv2_api.find(args, kwargs, replace(rule, **options), scores)
     except BaseException:
         _count(site, errors=1, seconds=time.perf_counter() - start)
         raise
@@ -154,12 +140,12 @@ def patch_cv2(
     False
     """
     global _lasting
-    patch = _checked(density, alpha, dc_percent)
+    rule = DensityRule(density, alpha, dc_percent)
     with _lock:
         if _lasting is not None:
             _patches.remove(_lasting)
-        _lasting = patch
-        _patches.append(patch)
+        _lasting = rule
+        _patches.append(rule)
         _install()
 
 
@@ -229,16 +215,16 @@ def patched(
     >>> bool((F == expected).all())
     True
     """
-    patch = _checked(density, alpha, dc_percent)
+    rule = DensityRule(density, alpha, dc_percent)
     with _lock:
-        _patches.append(patch)
+        _patches.append(rule)
         _install()
     try:
         yield
     finally:
         with _lock:
-            if patch in _patches:  # a reload forgets it
-                _patches.remove(patch)
+            if rule in _patches:  # a reload forgets it
+                _patches.remove(rule)
             _uninstall()
 
 
@@ -271,11 +257,6 @@ def reset_call_sites() -> None:
     """Forget all counts."""
     with _lock:
         _sites.clear()
-
-
-def _checked(density: Density, alpha: float, dc_percent: float) -> _Patch:
-    check_density(density, alpha, dc_percent)
-    return _Patch(density, alpha, dc_percent)
 
 
 def _install() -> None:

@@ -671,8 +671,8 @@ def test_graph_cut_is_cv2s_own_up_to_its_limit():
 def test_the_mask_is_of_the_scaled_matrix(monkeypatch):
     """Scaling moves the last bits of F, so the pipeline's mask will not do."""
 
-    def run(X, robust, **options):
-        found = pipeline(X, robust, **options)
+    def run(*args, **options):
+        found = pipeline(*args, **options)
         return dataclasses.replace(found, mask=~found.mask)
 
     pipeline = cv2_api.run

@@ -20,6 +20,7 @@ from cv_densityf import (
     estimate_fundamental,
     findFundamentalMat,
 )
+from cv_densityf._arguments import OFF
 from cv_densityf._consensus import search
 from cv_densityf._engine import METHODS, Robust, original
 from cv_densityf._epipolar import eight_point, inlier_mask, middle, sampson_distance
@@ -658,7 +659,7 @@ def test_run_takes_params_and_their_rule():
     X = scene_of().X
     result = run(X, Robust(cv2.USAC_DEFAULT, 2.0, 0.99, 1000, params))
     np.testing.assert_array_equal(result.mask, inlier_mask(result.F, X, "usac", 2.0))
-    plain = run(X, Robust(cv2.USAC_DEFAULT, 2.0, 0.99, 1000, params), density="off")
+    plain = run(X, Robust(cv2.USAC_DEFAULT, 2.0, 0.99, 1000, params), OFF)
     np.testing.assert_array_equal(plain.F, original(X[:, :2], X[:, 2:], params)[0])
     assert plain.engine == "usac"
 
