@@ -60,10 +60,10 @@ MAX_DRAW_ITERS = 1000
 #: more draws. If it is less than the second, local optimisation has something to gain.
 _AGREEMENT = 0.93
 _CLOSE_AGREEMENT = 0.98
-#: Where a plane is dominant, a hypothesis with this share of the inliers of the one with the most
-#: votes, and so many standard deviations of chance more off the plane, is the better one: these fix
-#: F, and are often sparse and of little reliability.
-_CONTAINED = 0.9
+#: Where a plane is dominant, a hypothesis with this share of the most votes, and so many standard
+#: deviations of chance more inliers off the plane, is the better one: these fix F, and are often
+#: sparse and of little reliability. With fewer votes it fits a crowd of wrong ones there.
+_NEARLY = 0.97
 _SIGNIFICANT = 2.0
 #: Working thresholds within which a match is on a plane.
 _PLANE_WIDTH = 2.0
@@ -105,9 +105,10 @@ _GROUPS = 4
 _PEAK = 0.8
 #: Hypotheses of a part of the matches that the others vote on.
 _FINALISTS = 3
-#: The winner has a way to go from where the part left it: in strides of this many steps of the
-#: polish, for wrong matches make them short, at a width of this many robust standard deviations.
-#: So long strides need not converge; more of them would not be better.
+#: From so many matches on the winner has a way to go: in strides of this many steps of the polish,
+#: for wrong matches make them short, at a width of this many robust standard deviations. So long
+#: strides need not converge; more of them would not be better.
+_MANY = 1_000
 _STRIDES = 10
 _STRIDE = 3.0
 _STRIDE_SIGMAS = 1.4
@@ -212,7 +213,7 @@ def search(
     pool.complete()
     if not pool.agrees(_CLOSE_AGREEMENT):
         pool.optimise(in_vain)
-    F = pool.refined_best() if others is None else pool.before(others - centre).settled_best()
+    F = (pool if others is None else pool.before(others - centre)).refined_best()
     F = shift(-centre[2:]).T @ F @ shift(-centre[:2])
     watch.lap("polish")
     agreed = pool.agrees_independently()
@@ -388,13 +389,12 @@ class _Pool:
         self.best = int(self.votes.argmax()) if self._off_plane is None else self._richest()
 
     def _richest(self) -> int:
-        """Index of the most votes, or of as many inliers on the plane and more off it."""
+        """Index of the most votes, or of nearly as many and more inliers off the plane."""
         elected = int(self.votes.argmax())
-        common = self._inliers @ self._inliers[elected]
         off_plane = self._inliers[:, self._off_plane]
         gain = off_plane - off_plane[elected]
         lead = gain.sum(axis=1) - _SIGNIFICANT * np.sqrt(np.abs(gain).sum(axis=1))
-        lead[common < _CONTAINED * common[elected]] = -np.inf
+        lead[self.votes < _NEARLY * self.votes[elected]] = -np.inf
         # Its own lead is 0.
         return int(lead.argmax()) if lead.max() > 0 else elected
 
@@ -499,8 +499,28 @@ class _Pool:
         return len(sizes) > 1 and bool(sizes.max() >= _DISTINCT * sizes.min())
 
     def refined_best(self) -> NDArray[np.float64]:
-        """Polish the best hypothesis at the width of its own residuals; in pixels, (3, 3)."""
-        return self._refined(self._G[self.best], self._squared[self.best])
+        """Polish the best hypothesis at the width of its own residuals; in pixels, (3, 3).
+
+        Of many matches as long as it moves, before the last steps.
+        """
+        G, squared = self._G[self.best], self._squared[self.best]
+        if len(squared) > _MANY:
+            G = self._settled(G, squared)
+            squared = self._frame.sampson(G[None])[0]
+        noise = _noise(squared[self._reliable], self.threshold)
+        sigma = max(noise, _NARROWEST * self.threshold)
+        doubt = _doubt(squared, sigma, self._reliability)
+        G = refine(self._frame, G, sigma, doubt, noise, _REFINE_STEPS)
+        return np.ascontiguousarray(self._frame.leave(G[None])[0])
+
+    def _settled(self, G: Floats, squared: Floats) -> Floats:
+        noise = _noise(squared[self._reliable], self.threshold)
+        width = max(_STRIDE_SIGMAS * noise, _NARROWEST * self.threshold)
+        end = step = G[None]
+        for _ in range(_STRIDES):
+            step = polish(self._frame, end, [width])
+            end = end + _STRIDE * (step - end)
+        return np.asarray(step[0])
 
     def _finalists(self, most: int, overlap: float) -> list[int]:
         """Return the indices of the best hypotheses whose inliers overlap by less."""
@@ -523,24 +543,6 @@ class _Pool:
         wider.working = self.working
         wider.add(self._frame.leave(self._G[chosen]), np.zeros(len(chosen)))
         return wider
-
-    def settled_best(self) -> NDArray[np.float64]:
-        """Polish the best hypothesis as long as it moves, then as always; in pixels, (3, 3)."""
-        G = self._G[[self.best]]
-        noise = _noise(self._squared[self.best, self._reliable], self.threshold)
-        width = max(_STRIDE_SIGMAS * noise, _NARROWEST * self.threshold)
-        step = G
-        for _ in range(_STRIDES):
-            step = polish(self._frame, G, [width])
-            G = G + _STRIDE * (step - G)
-        return self._refined(step[0], self._frame.sampson(step)[0])
-
-    def _refined(self, G: Floats, squared: Floats) -> NDArray[np.float64]:
-        noise = _noise(squared[self._reliable], self.threshold)
-        sigma = max(noise, _NARROWEST * self.threshold)
-        doubt = _doubt(squared, sigma, self._reliability)
-        G = refine(self._frame, G, sigma, doubt, noise, _REFINE_STEPS)
-        return np.ascontiguousarray(self._frame.leave(G[None])[0])
 
 
 def _alike(inliers: Floats, one: Floats, overlap: float) -> Bools:
