@@ -70,6 +70,14 @@ def _parser() -> argparse.ArgumentParser:
         metavar="RATIO",
         help="keep SIFT ratios below this; 'all' keeps everything (default)",
     )
+    real.add_argument(
+        "--n",
+        nargs="+",
+        default=[None],
+        type=int,
+        metavar="N",
+        help="so many matches of each pair, at random; default all",
+    )
     real.add_argument("--sets", nargs="+", metavar="SET", help="only these sets")
     real.add_argument(
         "--seed",
@@ -84,6 +92,9 @@ def _parser() -> argparse.ArgumentParser:
     render = commands.add_parser("render", help="write rendered pairs, as data for real")
     render.add_argument("--out", required=True, metavar="DIR", help="folder of .npz files")
     render.add_argument("--repeats", type=int, default=3, metavar="N", help="of each scene")
+    render.add_argument(
+        "--dense", action="store_true", help="as a matcher without a detector would match them"
+    )
     render.set_defaults(run=_render)
 
     synthetic = commands.add_parser("synthetic", parents=[shared], help="scenes with a known F")
@@ -160,19 +171,21 @@ def _cut(text: str) -> float | str:
 
 def _real(args: argparse.Namespace) -> int:
     runs = [
-        (
-            "all matches" if cut == "all" else f"SIFT ratio < {cut:g}",
-            seed,
-            load_pairs(args.data, cut, seed, args.sets),
-        )
+        (_section(cut, n), seed, load_pairs(args.data, cut, seed, args.sets, n))
         for cut in dict.fromkeys(args.cut)
+        for n in dict.fromkeys(args.n)
         for seed in dict.fromkeys(args.seed)
     ]
     return _compare(args, runs)
 
 
+def _section(cut: float | str, n: int | None) -> str:
+    matches = "all matches" if cut == "all" else f"SIFT ratio < {cut:g}"
+    return matches if n is None else f"{n} of {matches}"
+
+
 def _render(args: argparse.Namespace) -> int:
-    paths = write_pairs(args.out, args.repeats)
+    paths = write_pairs(args.out, args.repeats, args.dense)
     print(f"{len(paths)} pairs in {args.out}; now: python -m benchmarks real --data {args.out}")
     return 0
 

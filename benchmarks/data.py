@@ -86,6 +86,7 @@ def load_pairs(
     cut: float | str = "all",
     seed: int = 0,
     sets: Collection[str] | None = None,
+    n: int | None = None,
 ) -> list[Pair]:
     """Read the pairs of a folder.
 
@@ -100,6 +101,8 @@ def load_pairs(
         order-sensitive methods.
     sets : collection of str, optional
         Only these sets.
+    n : int, optional
+        Only so many matches of each pair, at random; pairs with fewer are left out.
 
     Raises
     ------
@@ -113,7 +116,7 @@ def load_pairs(
     if unknown := set(sets or ()) - groups:
         raise ValueError(f"no set {sorted(unknown)} in {folder}; it has {sorted(groups)}")
     limit = None if cut == "all" else float(cut)
-    pairs = (_load(path, limit, seed) for path in paths if not sets or _group(path) in sets)
+    pairs = (_load(path, limit, seed, n) for path in paths if not sets or _group(path) in sets)
     return [pair for pair in pairs if pair is not None]
 
 
@@ -121,7 +124,7 @@ def _group(path: Path) -> str:
     return path.stem.split("__")[0]
 
 
-def _load(path: Path, limit: float | None, seed: int) -> Pair | None:
+def _load(path: Path, limit: float | None, seed: int, n: int | None) -> Pair | None:
     with np.load(path) as file:
         d = dict(file)
     X = np.hstack([d["pts1"], d["pts2"]]).astype(np.float64)
@@ -133,7 +136,9 @@ def _load(path: Path, limit: float | None, seed: int) -> Pair | None:
     rows = np.arange(len(X))
     if limit is not None and ratio is not None:
         rows = rows[ratio < limit]
-    rows = np.random.default_rng(seed).permutation(rows)
+    rows = np.random.default_rng(seed).permutation(rows)[:n]
+    if n is not None and len(rows) < n:
+        return None
     return Pair(
         name=path.stem,
         group=_group(path),

@@ -7,6 +7,7 @@ cameras and truth points from the depth buffer, so that nothing in the truth com
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from benchmarks.data import Pair
+from benchmarks.dense import dense_matches
 from benchmarks.rendered import SCENES, camera_axes, facade, pair_of, photograph
 
 Floats = NDArray[np.float64]
@@ -33,7 +35,9 @@ _BEFORE_FACADE = ((-1.5, -7.0, 2.6), (0.0, 4.0, 4.0))
 _TRUTH = 400
 
 
-def write_pairs(folder: str | Path, repeats: int = 3, progress: bool = True) -> list[Path]:
+def write_pairs(
+    folder: str | Path, repeats: int = 3, dense: bool = False, progress: bool = True
+) -> list[Path]:
     """Render, match and write the pairs, a file each; the same ones whenever called.
 
     Parameters
@@ -42,6 +46,8 @@ def write_pairs(folder: str | Path, repeats: int = 3, progress: bool = True) -> 
         Is made if it does not exist.
     repeats : int
         Of each scene, with other textures and places.
+    dense : bool
+        With `dense_matches` in place of SIFT's, and no scores.
     progress : bool
         Whether to show a bar.
 
@@ -70,7 +76,10 @@ def write_pairs(folder: str | Path, repeats: int = 3, progress: bool = True) -> 
         view1, *others = photograph(build, [first, *moved], rng)
         for motion, view2 in zip(MOTIONS, others, strict=True):
             path = folder / f"{motion}__{name}{repeat}.npz"
-            _write(path, pair_of(path.stem, view1, view2))
+            pair = pair_of(path.stem, view1, view2)
+            if dense:
+                pair = replace(pair, X=dense_matches(view1, view2, rng), scores=None)
+            _write(path, pair)
             written.append(path)
     return written
 
@@ -88,16 +97,16 @@ def _moved(
 
 
 def _write(path: Path, pair: Pair) -> None:
-    assert pair.scores is not None
     assert pair.cameras is not None
-    order = np.argsort(-pair.scores, kind="stable")
+    ratio = np.ones(len(pair.X)) if pair.scores is None else 1.0 - pair.scores
+    order = np.argsort(ratio, kind="stable")
     truth = pair.truth[np.linspace(0, len(pair.truth) - 1, _TRUTH).astype(int)]
     np.savez_compressed(
         path,
         pts1=pair.X[order, :2],
         pts2=pair.X[order, 2:],
-        score=1.0 - pair.scores[order],
-        score_kind="sift_ratio",
+        score=ratio[order],
+        score_kind="none" if pair.scores is None else "sift_ratio",
         size1=np.array(pair.size1),
         size2=np.array(pair.size2),
         val1=truth[:, :2],
