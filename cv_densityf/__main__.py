@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import cv_densityf
-from cv_densityf._arguments import DENSITIES
+from cv_densityf._arguments import DENSITIES, DensityRule
 from cv_densityf._density import density_peaks
 from cv_densityf._engine import GRAPH_CUT_MAX, METHODS, Robust, method_flag, short_name
 from cv_densityf._epipolar import Floats, residuals
@@ -46,7 +46,6 @@ _LONG = 1000.0
 #: More points than this make a decision graph neither clearer nor quickly.
 _MAX_GRAPH_POINTS = 10_000
 _DEMO_ORDERS = 10
-_PAPERS_ALPHA = 0.011
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -213,7 +212,7 @@ def _add_match(commands: argparse._SubParsersAction[Any]) -> None:
         "and less accurate)",
     )
     estimate.add_argument(
-        "--alpha", metavar="A", type=_ALPHA, help=f"of --density paper ({_PAPERS_ALPHA})"
+        "--alpha", metavar="A", type=_ALPHA, help=f"of --density paper ({DensityRule.alpha})"
     )
     estimate.add_argument("--seed", metavar="N", type=_SEED, default=0, help="(%(default)s)")
     matching = match.add_argument_group("matching, for images")
@@ -342,7 +341,7 @@ def _run_match(options: argparse.Namespace) -> int:
             options.error(f"--points and {name} exclude each other")
     if options.alpha is not None and options.density != "paper":
         options.error("--alpha is of --density paper")
-    alpha = _PAPERS_ALPHA if options.alpha is None else options.alpha
+    alpha = DensityRule.alpha if options.alpha is None else options.alpha
     if options.plot is not None:
         from cv_densityf import plotting
 
@@ -414,6 +413,7 @@ def _run_match(options: argparse.Namespace) -> int:
     report = {
         "method": options.method,
         "threshold": options.threshold,
+        "scores": scores is not None,
         **_report(X, robust, estimate, plain, timings),
     }
     _say(json.dumps(report, allow_nan=False) if options.json else _for_people(report))
@@ -470,6 +470,7 @@ def _report(
         "F": _usable(estimate.F),
         "reason": estimate.reason,
         "n_matches": len(X),
+        "n_ranked": int(np.isfinite(estimate.reliability).sum()),
         "n_kept": int(estimate.kept.sum()),
         "n_inliers": estimate.n_inliers,
         "coherence": _coherence(X[estimate.mask]),
@@ -518,10 +519,13 @@ def _median_residual(F: Floats | None, X: Floats, robust: Robust) -> float | Non
 
 def _for_people(report: dict[str, Any]) -> str:
     times = report["timings_ms"]
-    ours = [report["n_kept"], *_result(report), f"{times['estimating']:.1f}"]
+    kept, ranked, n = (report[name] for name in ("n_kept", "n_ranked", "n_matches"))
+    kept = kept if ranked == n else f"{kept} of {ranked}"
+    ours = [kept, *_result(report), f"{times['estimating']:.1f}"]
     names = ["kept as dense", "inliers", "coherence", "median residual, px", "processor time, ms"]
     lines = [
-        f"{report['n_matches']} matches, {report['method']}, threshold {report['threshold']:g} px",
+        f"{n} matches{' with scores' if report['scores'] else ''}, {report['method']}, "
+        f"threshold {report['threshold']:g} px",
         "",
     ]
     if report["cv2"] is not None and "plain cv2" not in times:
@@ -578,7 +582,9 @@ def _write(
         arrays["scores"] = scores
     with replacing(path) as temporary:
         if path.suffix.lower() == ".npz":
-            np.savez(temporary, F=np.asarray(estimate.F), **arrays)
+            # To a stream, for to a name that ends in .NPZ it would add another .npz.
+            with temporary.open("wb") as stream:
+                np.savez(stream, F=np.asarray(estimate.F), **arrays)
         else:
             lists = {name: _finite_or_none(array) for name, array in arrays.items()}
             text = json.dumps({**report, **lists}, allow_nan=False)

@@ -62,7 +62,7 @@ def check_scores(scores: ArrayLike, n: int | None) -> NDArray[np.float64]:
 
     A column or a row will do, and so will infinities, since only the order counts.
     """
-    trust = _real(scores, "scores")
+    trust = real(scores, "scores")
     if trust.ndim not in (1, 2) or trust.size not in trust.shape:
         raise ValueError(f"scores has shape {trust.shape}; it must be (n,): one number a match")
     if n is not None and trust.size != n:
@@ -72,15 +72,18 @@ def check_scores(scores: ArrayLike, n: int | None) -> NDArray[np.float64]:
     return trust.ravel()
 
 
-def _real(values: ArrayLike, name: str) -> NDArray[np.float64]:
+def real(values: ArrayLike, name: str) -> NDArray[np.float64]:
+    """Return an array of float64, NaN for what is masked, or raise ValueError for complex ones."""
     array = np.asarray(values)
     if np.iscomplexobj(array):
         raise ValueError(f"{name} is of type {array.dtype}; it must be real numbers")
-    return np.asarray(array, dtype=np.float64)
+    array = np.asarray(array, dtype=np.float64)
+    hidden = np.ma.getmask(values)
+    return array if hidden is np.ma.nomask else np.where(hidden, np.nan, array)
 
 
 def _points(points: ArrayLike, name: str) -> NDArray[np.float64]:
-    array = _real(points, name)
+    array = real(points, name)
     if array.shape == (0,):
         return np.empty((0, 2))
     if array.ndim == 3 and 1 in array.shape[:2] and array.shape[2] == 2:

@@ -13,7 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist, pdist
 
+from cv_densityf._arguments import real
+
 Kernel = Literal["cutoff", "gaussian"]
+
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
@@ -284,7 +288,7 @@ def density_peaks(
 
 def checked_points(X: ArrayLike) -> Floats:
     """Return points (n, d) in float64, or raise ValueError where their distances are no numbers."""
-    points = np.ascontiguousarray(X, dtype=np.float64)
+    points = np.ascontiguousarray(real(X, "X"))
     if points.ndim != 2 or 0 in points.shape:
         raise ValueError(
             "X must be a two-dimensional array with at least one row (a point) and one column; "

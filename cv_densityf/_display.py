@@ -104,7 +104,8 @@ class DecisionGraphDisplay:
         ):
             if rows.any():
                 label = f"{name} ({np.count_nonzero(rows)})"
-                ax.scatter(rho[rows], delta[rows], **{**style, "label": label, **kwargs})
+                given = kwargs if name == "points" else {}
+                ax.scatter(rho[rows], delta[rows], **{**style, "label": label, **given})
         limit = 0.0 if self.alpha is None else self.alpha * rho.max() * delta.max()
         if limit > 0:
             curve = np.geomspace(limit / delta.max(), rho.max(), 200)

@@ -45,6 +45,8 @@ _SEARCH_THRESHOLD = 0.01
 _LEEWAY = 2.0
 #: An F that explains fewer matches than a minimal sample is none.
 _MINIMAL = 7
+#: A larger threshold, in units of the points' spread, is hardly meant.
+_COARSE = 0.1
 #: cv2's direct kernels take every match as true.
 _DIRECT = (1, 2)
 
@@ -151,7 +153,7 @@ def _estimate(
     n, density = len(X), rule.density
     finite = finite_in_cv2(X)
     rows = np.flatnonzero(finite)
-    direct = robust.params is None and robust.flag in _DIRECT
+    direct = robust.flag in _DIRECT
     if density == "off" or direct or len(rows) < MIN_FILTERED:
         why = "density is off" if density == "off" else f"{method_name(robust)} takes no filter"
         if len(rows) < MIN_FILTERED:
@@ -212,6 +214,10 @@ def _estimate(
     kept[rows] = support
     mask = inlier_mask(found.F, X, robust.rule, robust.threshold)
     watch.lap("mask")
+    reason = found.reason
+    if robust.rule != "lmeds" and robust.threshold > _COARSE * about[1]:
+        share = robust.threshold / about[1]
+        reason += f"; the threshold is {share:.2g} of the points' spread: are they in pixels?"
     if np.count_nonzero(mask) < _MINIMAL:
         return _plain(
             X, finite, robust, watch, "cv2's own call, since too few matches fit at this threshold"
@@ -224,7 +230,7 @@ def _estimate(
         n_draws=found.n_draws,
         agreed=found.agreed,
         engine="density",
-        reason=found.reason,
+        reason=reason,
         timings=watch.laps,
         votes=found.votes,
     )
@@ -299,8 +305,10 @@ def _plain(
     """Answer as cv2 itself does on the finite matches."""
     n_finite = int(np.count_nonzero(finite))
     heard = finite
-    if robust.rule == "ransac" and n_finite < MIN_FILTERED <= len(X):
-        # It would be another method on so few; RANSAC itself knows rows that are not numbers.
+    if (robust.rule == "ransac" and n_finite < MIN_FILTERED <= len(X)) or (
+        robust.rule == "lmeds" and n_finite == _MINIMAL < len(X)
+    ):
+        # It would be another method on so few; these know rows that are not numbers.
         heard = np.ones_like(finite)
     Z = X if heard.all() else X[heard]
     asked, robust = robust, robust.for_size(len(Z))

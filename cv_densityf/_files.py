@@ -166,7 +166,8 @@ def _read_csv(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | No
             numbers.extend([float(cell) for cell in cells])
         except ValueError:
             bad = next(cell for cell in cells if not _is_number(cell))
-            raise InputError(f"line {line}: {_shortened(bad)!r} is not a number") from None
+            blank = ", but blank: write no index, such as pandas does" if not bad else ""
+            raise InputError(f"line {line}: {_shortened(bad)!r} is not a number{blank}") from None
     table = np.array(numbers).reshape(-1, width)
     return table[:, :4], table[:, 4] if width == 5 else None
 
@@ -205,8 +206,8 @@ def _check_header(cells: list[str]) -> None:
     shown = _shortened(",".join(cells))
     if names[:4] not in _HEADERS or (len(names) == 5 and names[4] not in _SCORE_KEYS):
         raise InputError(
-            f"header {shown!r} is not x,y,x',y' or x1,y1,x2,y2, with score as an "
-            "optional fifth name"
+            f"header {shown!r} is not x,y,x',y' or x1,y1,x2,y2, separated by commas, with score "
+            "as an optional fifth name"
         )
 
 

@@ -36,10 +36,7 @@ _CHUNK = 4096
 
 
 def density_contrast(
-    X: Floats,
-    n_neighbors: int | None = None,
-    rows: Ints | None = None,
-    among: Ints | None = None,
+    X: Floats, rows: Ints | None = None, among: Ints | None = None
 ) -> NDArray[np.float64]:
     """How much denser the matches lie around each match in 4-D than chance would put them.
 
@@ -47,15 +44,13 @@ def density_contrast(
     were paired at random, two neighbourhoods of k matches out of n would share k^2 / n; around a
     right match most neighbours are shared. Each shared neighbour counts 1 / rank, rank being its
     place (1, 2, ...) in the list where it stands later, which averages the density over all
-    neighbourhood sizes up to ``n_neighbors``. Copies of a match do not count. Locality preserving
+    neighbourhood sizes up to `N_NEIGHBORS`. Copies of a match do not count. Locality preserving
     matching (Ma et al., IJCV 2019) counts shared neighbours, too.
 
     Parameters
     ----------
     X : array, shape (n, 4)
         Finite matches x, y, x', y', n >= 2.
-    n_neighbors : int, optional
-        Largest neighbourhood, `N_NEIGHBORS` by default.
     rows : array of int, shape (m,), optional
         The matches to tell it of, by default all.
     among : array of int, shape (l,), optional
@@ -68,7 +63,7 @@ def density_contrast(
     """
     n = len(X)
     among = np.arange(n) if among is None else among
-    k = min(n_neighbors or N_NEIGHBORS, len(among) - 1) + 1
+    k = min(N_NEIGHBORS, len(among) - 1) + 1
     # In float32 what matters is how far the points are from each other, not from the origin.
     Y = X - np.partition(X, n // 2, axis=0)[n // 2]
     Y = Y.clip(-_FARTHEST, _FARTHEST).astype(np.float32)
@@ -123,8 +118,9 @@ def beyond_chance(contrast: Floats, n: int, n_among: int) -> bool:
 def coherence(X: Floats) -> float:
     """Mean contrast of matches (n, 4), on a scale from 0 by chance to 1 for the most there can be.
 
-    NaN for fewer than three.
+    NaN for fewer than three. Copies would take the places of neighbours, so one of them counts.
     """
+    X = np.unique(X, axis=0) if len(X) else X
     if len(X) < 3:
         return np.nan
     rank, expected = _by_chance(len(X))

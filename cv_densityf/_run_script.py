@@ -126,7 +126,10 @@ def _print_report() -> None:
 def _report() -> str:
     sites = call_sites()
     if not sites:
-        return "cv-densityf: cv2.findFundamentalMat was not called through the patch"
+        return (
+            "cv-densityf: cv2.findFundamentalMat was not called through the patch in this process; "
+            "what worker processes called is not counted"
+        )
     names = ("calls", "cv2's own", "errors", "no model", "matches", "inliers", "ms a call")
     lines = ["cv-densityf: calls of cv2.findFundamentalMat, and their matches"]
     lines.append("".join(f"{name:>10}" for name in names) + "  line")

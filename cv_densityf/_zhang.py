@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cv_densityf._arguments import real
+
 Floats = NDArray[np.float64]
 
 #: Points drawn for each one wanted, before lines that miss the image are given up.
@@ -126,7 +128,7 @@ def _along(lines: Floats, size: Floats, shares: Floats) -> tuple[Floats, NDArray
 
 
 def _matrix(F: ArrayLike, name: str) -> Floats:
-    F = np.asarray(F, dtype=np.float64)
+    F = real(F, name)
     if F.shape != (3, 3):
         raise ValueError(
             f"{name} has shape {F.shape}; it must be one fundamental matrix, (3, 3). "

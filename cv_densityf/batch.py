@@ -48,9 +48,10 @@ def estimate_many(
     Returns
     -------
     iterator of Estimate
-        In the order of ``pairs``. Each equals ``estimate_fundamental(*pair, **options)``, whatever
-        ``n_jobs`` and ``backend`` are. A pair that cannot be estimated, or whose worker process
-        died of it, gets a falsy `Estimate` whose ``reason`` says so; the others go on.
+        In the order of ``pairs``. Each equals what `estimate_fundamental` makes of the pair with
+        these options, whatever ``n_jobs`` and ``backend`` are. A pair that cannot be estimated, or
+        whose worker process died of it, gets a falsy `Estimate` whose ``reason`` says so; the
+        others go on.
 
     Raises
     ------
@@ -187,7 +188,7 @@ def _one(pair: Pair, options: dict[str, Any]) -> Estimate:
     try:
         items = tuple(pair) if isinstance(pair, Iterable) else None
         if items is None or not 2 <= len(items) <= 3:
-            given = repr(pair) if items is None else f"{len(items)} items"
+            given = type(pair).__name__ if items is None else f"{len(items)} items"
             raise ValueError(
                 f"a pair is (points1, points2) or (points1, points2, scores), not {given}"
             )

@@ -145,9 +145,14 @@ def verify_matches(
         raise ValueError(f"min_inliers is {min_inliers}; it must be at least 8")
     if not min_coherence <= 1:
         raise ValueError(f"min_coherence is {min_coherence}; it must be a number up to 1")
+    asked: dict[str, Any] = {
+        "n_jobs": n_jobs, "progress": False, "method": method, "threshold": threshold, **options
+    }  # fmt: skip
     path = Path(database)
     with _open(path, write=not dry_run) as connection:
         n_pairs = _check(connection)
+        # Checks the options, also where there is nothing left to do.
+        estimate_many((), **asked)
         where = "WHERE pair_id NOT IN (SELECT pair_id FROM two_view_geometries)" if resume else ""
         todo = [
             pair_id
@@ -163,14 +168,7 @@ def verify_matches(
             for start in range(0, len(todo), _CHUNK):
                 part = todo[start : start + _CHUNK]
                 pairs = [_load(connection, keypoints, pair_id) for pair_id in part]
-                estimates = estimate_many(
-                    [points for _, points in pairs],
-                    n_jobs=n_jobs,
-                    progress=False,
-                    method=method,
-                    threshold=threshold,
-                    **options,
-                )
+                estimates = estimate_many([points for _, points in pairs], **asked)
                 rows = []
                 for pair_id, (matches, points), estimate in zip(
                     part, pairs, estimates, strict=True

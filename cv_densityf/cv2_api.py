@@ -261,7 +261,7 @@ def find(
             if kwargs.keys() - KEYWORDS:
                 error.add_note("cv_densityf adds density, alpha, dc_percent and scores to these.")
             raise
-    usac = call.params is not None or is_usac(call.method)
+    usac = is_usac(call.method)
     points1, points2 = as_array(call.points1), as_array(call.points2)
     n = None if points1 is None or points2 is None else _common_length(points1, points2, usac)
     trust = None if scores is None else check_scores(scores, n)

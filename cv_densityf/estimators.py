@@ -300,8 +300,8 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
             Matches x, y, x', y', in pixels. ``rule="paper"`` takes any number of columns.
         y : ignored
         sample_weight : array_like, shape (n,), optional
-            Trust in each row, finite, higher is better; only its order counts. It is used as the
-            ``scores`` of `cv_densityf.estimate_fundamental` are: rows are ordered by a sum of ranks
+            Trust in each row, finite and not all 0; higher is better, only its order counts. It is
+            used as the ``scores`` of `estimate_fundamental` are: rows are ordered by a sum of ranks
             in which that by density counts four times, and by the contrast rule the worst fifth
             does not count as neighbours. ``reliability_`` is the rank of that sum. The better half
             is kept by the contrast rule, by the paper's as many rows as without.
@@ -468,6 +468,8 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
     reason_ : str
         How ``F_`` came about, in a few words: the ``reason`` of an `Estimate`, or that cv2's own
         call made it.
+    agreed_ : bool
+        Whether another draw found the same, see `Estimate`. False where cv2's own call made ``F_``.
     n_features_in_ : int
         Always 4.
     feature_names_in_ : ndarray of str, shape (4,)
@@ -541,9 +543,9 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
             Matches x, y, x', y', in pixels, n >= 8.
         y : ignored
         sample_weight : array_like, shape (n,), optional
-            Trust in each match, finite, higher is better, such as 1 - SIFT ratio; only its order
-            counts. "auto" uses it as its ``scores``; a prefilter gets it where its ``fit`` has such
-            a parameter; a plain call of cv2 has no use for it.
+            Trust in each match, such as 1 - SIFT ratio, finite and not all 0: higher is better,
+            only its order counts. "auto" uses it as its ``scores``; a prefilter gets it where its
+            ``fit`` has such a parameter; a plain call of cv2 has no use for it.
         **params
             Metadata for the prefilter's ``fit``, where metadata routing is enabled.
 
@@ -566,6 +568,9 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
             from those it leaves; all rows are used then.
         """
         self._validate_params()
+        if isinstance(self.prefilter, type):
+            name = self.prefilter.__name__
+            raise TypeError(f"prefilter is the class {name}; give an object, such as {name}()")
         robust = Robust(
             method_flag(self.method), float(self.threshold), float(self.confidence),
             int(self.max_iters),
@@ -579,9 +584,11 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         prefilter_params = self._prefilter_params(weight, params)
 
         self.prefilter_: Any = None
+        self.agreed_: bool = False
         if isinstance(self.prefilter, str):
             estimate = run(matches, robust, scores=weight, seed=self._seed())
             F, candidates, reason = estimate.F, estimate.kept, estimate.reason
+            self.agreed_ = estimate.agreed
         else:
             candidates = np.ones(len(matches), dtype=bool)
             if self.prefilter is not None:

@@ -83,8 +83,18 @@ def test_rows_that_are_not_finite_and_outliers_do_not_count():
 
 @pytest.mark.parametrize("n", [0, 2])
 def test_it_is_nan_for_fewer_than_three(n):
-    assert np.isnan(coherence(np.zeros((n, 2)), np.zeros((n, 2))))
-    assert coherence(np.zeros((3, 2)), np.zeros((3, 2))) < 0
+    points = np.random.default_rng(0).uniform(0, 100, (3, 2))
+    assert np.isnan(coherence(points[:n], points[:n]))
+    assert not np.isnan(coherence(points, points))
+
+
+@pytest.mark.parametrize("times", [2, 20])
+def test_copies_change_nothing(times):
+    """SIFT gives a point of two orientations twice."""
+    X = two_view_scene(100, inlier_ratio=0.7, random_state=0).X
+    copies = np.repeat(X, times, axis=0)
+    whole = coherence(X[:, :2], X[:, 2:])
+    assert coherence(copies[:, :2], copies[:, 2:]) == pytest.approx(whole)
 
 
 def test_a_mask_of_another_length_is_refused():

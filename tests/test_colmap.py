@@ -362,7 +362,7 @@ def test_a_pair_that_fails_is_named_and_left_to_resume(database, monkeypatch):
 
     def fails_once(points1, points2, **options):
         calls.append(len(points1))
-        if len(calls) == 3:  # the first checks the options
+        if len(calls) == 4:  # the first two check the options
             raise MemoryError("no room")
         return genuine(points1, points2, **options)
 
@@ -373,6 +373,13 @@ def test_a_pair_that_fails_is_named_and_left_to_resume(database, monkeypatch):
     assert len(rows(database)) == 3
     assert verify_matches(database, resume=True).n_before == 3
     assert len(rows(database)) == 4
+
+
+@pytest.mark.parametrize("wrong", [{"threshold": -3.0}, {"n_jobs": 0}, {"nonsense": 1}])
+def test_wrong_options_are_refused_even_if_nothing_is_left_to_do(database, wrong):
+    verify_matches(database)
+    with pytest.raises((TypeError, ValueError)):
+        verify_matches(database, resume=True, **wrong)
 
 
 def test_not_even_half_a_transaction(database, monkeypatch):

@@ -229,8 +229,9 @@ def test_the_same_call_is_shown_once(run, npz, options):
     assert re.search(r"^processor time, ms +[\d.]+$", text, re.MULTILINE)
 
 
-def test_output_npz_can_be_read_back(run, npz, tmp_path):
-    path = tmp_path / "out.npz"
+@pytest.mark.parametrize("name", ["out.npz", "OUT.NPZ"])
+def test_output_npz_can_be_read_back(run, npz, tmp_path, name):
+    path = tmp_path / name
     code, out, _ = run("match", "--points", npz, "--json", "-o", path)
     assert code == 0
     with np.load(path, allow_pickle=False) as found:
@@ -460,8 +461,8 @@ def test_wrong_use(run, npz, tmp_path, arguments, message):
 
 
 def test_full_disk_leaves_no_half_file(run, npz, tmp_path, monkeypatch):
-    def full(path, **arrays):
-        path.write_bytes(b"half")
+    def full(stream, **arrays):
+        stream.write(b"half")
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(np, "savez", full)

@@ -291,6 +291,20 @@ def test_only_much_that_is_unexplained_is_drawn_from(wrong, made, monkeypatch):
         assert 0.8 * n < len(draws[2][0]) <= n
 
 
+def test_what_is_not_ranked_has_half_a_vote(monkeypatch):
+    told = []
+
+    class Spied(_Ballot):
+        def __init__(self, X, reliability):
+            told.append(reliability)
+            super().__init__(X, reliability)
+
+    monkeypatch.setattr(_consensus, "_Ballot", Spied)
+    rank = np.where(np.arange(600) < 300, np.linspace(0, 1, 600), np.nan)
+    find(scene_of(0).X, rank)
+    np.testing.assert_array_equal(told[0], np.where(np.isnan(rank), 0.5, rank))
+
+
 def test_two_different_answers_are_no_agreement(monkeypatch):
     """The search goes through all its rounds when no two draws are of the same geometry."""
     X = scene_of(0).X
@@ -377,8 +391,30 @@ def test_on_a_plane_what_differs_on_it_does_not_count():
     assert elected(squared, 98, off_plane=np.arange(60) >= 44).best == 1
 
 
+def test_of_the_same_inliers_off_the_plane_those_with_more_votes_win():
+    squared = np.full((2, 60), 9.0)
+    squared[:, :40] = 0.0
+    pool = elected(squared, 101, off_plane=np.arange(60) >= 38)
+    assert pool.best == 1
+
+
+def test_what_has_lost_off_the_plane_is_no_finalist():
+    squared = np.full((2, 60), 9.0)
+    squared[0, :40] = squared[1, :48] = 0.0
+    assert elected(squared, 98, off_plane=np.arange(60) >= 38)._finalists(2, 0.9) == [1]
+
+
+def test_a_search_for_planes_that_fails_costs_nothing_else(monkeypatch):
+    def fail(*_):
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr(_consensus, "plane_and_parallax", fail)
+    scene = scene_of(0)
+    assert sampson_distance(find(scene.X).F, true_matches(0)).mean() < 1.0
+
+
 def elected(squared, votes, off_plane):
-    """Pool of two hypotheses of 100 and of fewer votes, by their residuals."""
+    """Pool of two hypotheses of 100 and of so many votes, by their residuals."""
     pool = _Pool(true_matches(0, 60), np.ones(60), np.arange(60), 1.0, np.random.default_rng(0))
     pool._off_plane = off_plane
     pool._append(np.ones((2, 3, 3)), squared, np.array([100.0, votes]), [30, 60])

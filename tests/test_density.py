@@ -351,3 +351,8 @@ def test_labels_and_halo_refuse_what_does_not_fit():
             peaks.labels(centers)
     with pytest.raises(ValueError, match="shape"):
         peaks.halo([0, 0])
+
+
+def test_complex_points_are_refused():
+    with pytest.raises(ValueError, match="X is of type complex128"):
+        density_peaks(np.ones((5, 2)) + 1j)

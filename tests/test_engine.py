@@ -260,3 +260,16 @@ def test_params_say_whether_the_best_rows_come_first():
         params.sampler = sampler
         robust = Robust(cv2.FM_RANSAC, 1.0, 0.99, 100, params)
         assert robust.best_first == (sampler == cv2.SAMPLING_PROSAC)
+
+
+def test_seeds_of_32_bits_are_all_different_states(monkeypatch):
+    states = []
+
+    def spy(points1, points2, params):
+        states.append(params.randomGeneratorState)
+        return None, None
+
+    monkeypatch.setattr(_engine, "original", spy)
+    for seed in (0, 2**31 - 1, 2**31, 2**32 - 1):
+        _engine.draw(np.zeros((20, 4), dtype=np.float32), 1.0, 0.99, 10, seed)
+    assert len(set(states)) == 4

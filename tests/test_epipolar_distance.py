@@ -220,3 +220,8 @@ def test_says_what_is_wrong():
         epipolar_distance(ROWS, ROWS, (640, 480, 3), SIZE2)
     with pytest.raises(ValueError, match="n is 0"):
         epipolar_distance(ROWS, ROWS, SIZE1, SIZE2, n=0)
+
+
+def test_complex_matrices_are_refused():
+    with pytest.raises(ValueError, match="F1 is of type complex128"):
+        epipolar_distance(np.eye(3), 1j * np.eye(3), (640, 480), (640, 480))

@@ -664,6 +664,29 @@ def test_run_takes_params_and_their_rule():
     assert plain.engine == "usac"
 
 
+def test_seven_numbers_among_more_rows_are_no_minimal_sample():
+    """Of seven finite rows alone cv2 would stack all matrices through them."""
+    X = scene_of().X[:20].copy()
+    X[7:] = np.nan
+    found = estimate(X, method="lmeds")
+    assert found.F is None or found.F.shape == (3, 3)
+
+
+@pytest.mark.parametrize(("scale", "asked"), [(1.0, False), (1e-3, True)])
+def test_a_threshold_as_wide_as_the_points_is_asked_about(scale, asked):
+    assert ("are they in pixels?" in estimate(scale * scene_of().X).reason) == asked
+    assert "are they in pixels?" not in estimate(scale * scene_of().X, method="lmeds").reason
+
+
+def test_what_is_masked_is_no_number():
+    scene = scene_of()
+    hidden = np.flatnonzero(scene.inliers)[:20]
+    X = np.ma.masked_array(scene.X, np.isin(np.arange(len(scene.X)), hidden)[:, None].repeat(4, 1))
+    assert not estimate(X).mask[hidden].any()
+    with pytest.raises(ValueError, match="scores has NaN"):
+        estimate(scene.X, scores=X[:, 0])
+
+
 def test_matches_beyond_the_search_refine_the_result(monkeypatch):
     searched, all_rows = [], []
     for seed in range(6):

@@ -584,6 +584,8 @@ def test_decision_graph_display(scene):
     graph = np.column_stack([clusterer.rho_, clusterer.delta_])
     np.testing.assert_array_equal(centers, graph[np.sort(clusterer.cluster_centers_indices_)])
     assert len(points) + len(centers) == len(graph)
+    sizes = [drawn.get_sizes()[0] for drawn in ax.collections]
+    assert sizes[0] == 5 < sizes[1]
     x, y = ax.lines[0].get_data()
     np.testing.assert_allclose(x * y, 0.3 * clusterer.rho_.max() * clusterer.delta_.max())
 
@@ -622,3 +624,14 @@ def test_points_whose_distances_overflow_are_refused(rule):
     X = two_view_scene(50, random_state=0).X * 1e160
     with pytest.raises(ValueError, match="rescale"):
         DensityPeaksFilter(rule=rule).fit(X)
+
+
+def test_a_prefilter_is_an_object(scene):
+    with pytest.raises(TypeError, match=r"give an object, such as DensityPeaksFilter\(\)"):
+        FundamentalMatrixEstimator(DensityPeaksFilter).fit(scene.X)
+
+
+def test_the_estimator_tells_whether_draws_agreed(scene):
+    found = estimate_fundamental(scene.X[:, :2], scene.X[:, 2:])
+    assert FundamentalMatrixEstimator().fit(scene.X).agreed_ is found.agreed is True
+    assert FundamentalMatrixEstimator(None).fit(scene.X).agreed_ is False

@@ -11,7 +11,6 @@ from scipy.stats import rankdata
 
 from cv_densityf import _prefilter
 from cv_densityf._prefilter import (
-    N_NEIGHBORS,
     best_scored,
     beyond_chance,
     contrast_support,
@@ -51,41 +50,45 @@ def contrast_by_definition(X, k, among=None):
     return contrast
 
 
+@pytest.fixture
+def neighbors(monkeypatch):
+    """Sets how many neighbours are looked at."""
+    return lambda k: monkeypatch.setattr(_prefilter, "N_NEIGHBORS", k)
+
+
 @pytest.mark.parametrize("k", [1, 3, 10, 200])
 @pytest.mark.parametrize("n", [2, 3, 12, 90])
-def test_contrast_is_the_definition(n, k):
+def test_contrast_is_the_definition(n, k, neighbors):
+    neighbors(k)
     X = two_view_scene(n, inlier_ratio=0.5, random_state=n).X
     expected = contrast_by_definition(X, min(k, n - 1))
-    np.testing.assert_allclose(density_contrast(X, k), expected, rtol=1e-12)
+    np.testing.assert_allclose(density_contrast(X), expected, rtol=1e-12)
 
 
-def test_only_those_among_count_as_neighbours():
+def test_only_those_among_count_as_neighbours(neighbors):
     """Outsiders have as many as the others, although they do not find themselves there."""
     X = scene_of(6, 90).X
     among = np.random.default_rng(0).permutation(90)[:60]
     for k in (1, 8, 59):
+        neighbors(k)
         np.testing.assert_allclose(
-            density_contrast(X, k, among=among),
+            density_contrast(X, among=among),
             contrast_by_definition(X, k, among),
             rtol=1e-12,
         )
 
 
 @pytest.mark.parametrize("columns", [slice(0, 2), slice(2, 4)])
-def test_contrast_is_the_definition_where_two_matches_share_a_point(columns):
+def test_contrast_is_the_definition_where_two_matches_share_a_point(columns, neighbors):
     """As a keypoint with two orientations may: neither is then sure to stand first in its list."""
+    neighbors(7)
     X = scene_of(8, 80).X
     X[40, columns] = X[0, columns]
     # For all others these two are equally near, in either order.
     two = [0, 40]
     np.testing.assert_allclose(
-        density_contrast(X, 7)[two], contrast_by_definition(X, 7)[two], rtol=1e-12
+        density_contrast(X)[two], contrast_by_definition(X, 7)[two], rtol=1e-12
     )
-
-
-def test_contrast_looks_at_so_many_neighbours_unless_told():
-    X = scene_of(0, 60).X
-    np.testing.assert_array_equal(density_contrast(X), density_contrast(X, N_NEIGHBORS))
 
 
 def test_contrast_does_not_depend_on_how_the_work_is_cut(monkeypatch):
@@ -175,21 +178,23 @@ def test_a_match_however_far_out_changes_nothing_for_the_others(far):
     np.testing.assert_array_equal(moved, density_contrast(X.round()))
 
 
-def test_no_contrast_exceeds_that_of_shared_neighbourhoods_even_with_duplicates():
+def test_no_contrast_exceeds_that_of_shared_neighbourhoods_even_with_duplicates(neighbors):
+    neighbors(5)
     X = scene_of(2, 100, inlier_ratio=0.0).X
     X[:30] = X[0]
     X[30:35, :2] = X[30, :2]
-    contrast = density_contrast(X, 5)
+    contrast = density_contrast(X)
     assert contrast.min() >= 0
     assert contrast.max() <= (1 / np.arange(1, 6)).sum() + 1e-12
 
 
-def test_copies_of_a_match_do_not_vouch_for_it():
+def test_copies_of_a_match_do_not_vouch_for_it(neighbors):
     """Features with two orientations give the same match twice, right or wrong."""
+    neighbors(5)
     rng = np.random.default_rng(0)
     X = rng.uniform(0, 1000, (200, 4))
     X[100:] = X[:100]
-    assert density_contrast(X, 5).mean() < 0.1
+    assert density_contrast(X).mean() < 0.1
 
 
 def test_all_matches_equal_is_no_error():
@@ -199,13 +204,14 @@ def test_all_matches_equal_is_no_error():
         assert np.isfinite(contrast).all()
 
 
-def test_right_pairs_share_all_their_neighbours_and_random_pairs_few():
+def test_right_pairs_share_all_their_neighbours_and_random_pairs_few(neighbors):
     """Identical images give the harmonic number; chance pairing shares k^2 / n neighbours."""
+    neighbors(10)
     rng = np.random.default_rng(0)
     Y = rng.uniform(0, 1000, (2000, 2))
-    same = density_contrast(np.hstack([Y, Y]), 10)
+    same = density_contrast(np.hstack([Y, Y]))
     np.testing.assert_allclose(same, (1 / np.arange(1, 11)).sum())
-    chance = density_contrast(np.hstack([Y, rng.permutation(Y)]), 10)
+    chance = density_contrast(np.hstack([Y, rng.permutation(Y)]))
     assert chance.mean() < 10 * 10 / 2000
 
 
