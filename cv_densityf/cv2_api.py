@@ -189,14 +189,17 @@ def findFundamentalMat(
         methods scale it to ``F[2, 2] == 1`` and USAC to nothing in particular, and exactly 7 points
         give a classic method up to three matrices below each other, (9, 3).
     mask : (N, 1) ndarray of uint8, cv2.UMat if the points were, or None
-        1 for inliers: the method's own rule applied to ``F`` and all N matches. There is none for
-        fewer than 7 points and where ``params`` finds no model: None then, or an empty UMat if the
-        points were one, or the ``mask`` passed in, as it was for up to 7 points, else in zeros.
+        1 for inliers: the method's own rule applied to ``F`` and all N matches. The classic methods
+        have none for fewer than 7 points, nor has ``params`` where it finds no model: None then, or
+        an empty UMat if the points were one, or the ``mask`` passed in, as it was for up to 7
+        points, else in zeros.
 
     Raises
     ------
     cv2.error
-        Where cv2 refuses the call: it is cv2's own error.
+        Where cv2 refuses the call: it is cv2's own error. ``USAC_*`` and ``params`` refuse fewer
+        than 7 points, ``USAC_FM_8PTS`` fewer than 8. With a threshold of 1e-3 and less MAGSAC,
+        which is cv2's own call then, mostly raises.
     ValueError
         For a wrong ``density``, ``alpha``, ``dc_percent`` or ``scores``.
 
@@ -220,9 +223,9 @@ def findFundamentalMat(
     Deliberate differences from cv2: where ``FM_RANSAC`` and ``FM_LMEDS`` find no model cv2 returns
     uninitialised memory as the mask; there, and with ``cv2.UsacParams``, it leaves a given ``mask``
     as it was. Here both are zeros.
-    Where cv2's solver raises on valid points, or would take the process down (graph cut on more
-    than 46,340 points in OpenCV 5.0), this function goes on with another engine and answers
-    ``None`` only when that finds no model either.
+    Where cv2's solver raises on valid points (but for MAGSAC at so small a threshold), or would
+    take the process down (graph cut on more than 46,340 points in OpenCV 5.0), this function goes
+    on with another engine and answers ``None`` only when that finds no model either.
 
     References
     ----------

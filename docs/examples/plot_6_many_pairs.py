@@ -46,8 +46,10 @@ values = [
 n_inliers = [estimate.n_inliers for estimate in estimates[:80]]
 
 # %%
-# The truth, known here, agrees: above .5 F is right, or nearly, below .35 it means nothing. Between
+# The truth, known here, agrees: above .5 most inliers are right, below .35 F means nothing. Between
 # them are pairs of which a few right matches were found, too few for F. Numbers of inliers overlap.
+# How exact F is, coherence hardly says: above .5 it is 2 to 3 px off in the median, but 5 to 26 px
+# in a quarter of the pairs, nearly all of them with fewer than sixty inliers.
 
 distances = [
     epipolar_distance(estimate.F, scene.F, scene.size, scene.size)
