@@ -87,7 +87,7 @@ class Estimate:
         The vote for each polished hypothesis of the last search, in the order of the draws; then
         for those of a dominant plane and of the local optimisation, where there were any.
         Of many matches, those of the part that searched. Where a plane is dominant, the winner's
-        need not be the largest: the number of inliers off the plane decides.
+        may be 3 % less than the largest: among these the number of inliers off the plane decides.
 
     See Also
     --------
