@@ -51,11 +51,8 @@ _NEAR_WIDTH = 8.0
 #: that is the larger one has most of these, so that this draw is short.
 _UNEXPLAINED = 0.25
 _SHORT_DRAW_ITERS = 200
-#: Matches a draw gets at least: fewer crowd on too little of the image to fix F. Two thirds of few
-#: will do, so that there are other draws to agree with, but not fewer than these, which agree by
-#: accident.
+#: Matches a draw gets at least: fewer crowd on too little of the image to fix F.
 MIN_DRAW = 30
-_LEAST_DRAW = 20
 #: cv2's iterations in one draw from a quarter of the ranked matches, and less from larger, less
 #: pure parts. More find no better F; several short draws do.
 MAX_DRAW_ITERS = 1000
@@ -264,7 +261,6 @@ def _fill(
     not lie ``together`` more than by chance, and neither do the inliers of the best hypothesis.
     """
     points = X[order].astype(np.float32)
-    least = min(MIN_DRAW, max(_LEAST_DRAW, 2 * len(order) // 3))
     n_draws, agreed, asked_rest = 0, False, False
     for number, fractions in enumerate(ROUNDS, start=1):
         parts = []
@@ -275,7 +271,7 @@ def _fill(
             elif fraction == NEAR and len(pool):
                 part = points[pool.near_best(_NEAR_WIDTH)[order]]
             elif fraction > 0.0:
-                part = points[: max(least, int(len(order) * fraction))]
+                part = points[: max(MIN_DRAW, int(len(order) * fraction))]
             else:
                 continue
             share = min(max(len(part) / len(order), 0.25), 1.0)

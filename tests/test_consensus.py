@@ -144,10 +144,9 @@ def test_ends_when_two_draws_agree():
     assert np.mean(n_poor) > 1.5 * np.mean(n_clean)
 
 
-@pytest.mark.parametrize(("n", "least"), [(20, 20), (36, 24), (100, 30)])
-def test_small_parts_have_thirty_matches_or_two_thirds(monkeypatch, n, least):
-    """Of twenty matches every part is all of them, so that agreement says nothing."""
-    scene = scene_of(0, n=n, inlier_ratio=0.9)
+def test_draws_from_the_same_matches_are_no_agreement(monkeypatch):
+    """Of 30 matches every part is all of them, so that agreement says nothing."""
+    scene = scene_of(0, n=30, inlier_ratio=0.9)
     sizes = []
     draw = _consensus.draw
 
@@ -156,9 +155,9 @@ def test_small_parts_have_thirty_matches_or_two_thirds(monkeypatch, n, least):
         return draw(points, *args, **kwargs)
 
     monkeypatch.setattr(_consensus, "draw", spied)
-    agreed = find(scene.X).agreed
-    assert sizes[0] == least
-    assert n > 20 or (len(sizes) > 2 and not agreed)
+    find(scene.X)
+    assert len(sizes) > 2
+    assert sizes[:2] == [30, 30]
 
 
 def impossible(rng, X):
