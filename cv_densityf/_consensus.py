@@ -106,10 +106,12 @@ _PEAK = 0.8
 #: Hypotheses of a part of the matches that the others vote on.
 _FINALISTS = 3
 #: From so many matches on the winner has a way to go: in strides of this many steps of the polish,
-#: for wrong matches make them short, at a width of this many robust standard deviations. So long
-#: strides need not converge; more of them would not be better.
+#: for wrong matches make them short, at a width of this many robust standard deviations, until a
+#: step is as short a part of one. So long strides need not converge; more of them would not be
+#: better.
 _MANY = 1_000
 _STRIDES = 10
+_AT_REST = 0.03
 _STRIDE = 3.0
 _STRIDE_SIGMAS = 1.4
 #: Noise may exceed the threshold; residuals beyond this many of it are wrong matches.
@@ -519,7 +521,10 @@ class _Pool:
         end = step = G[None]
         for _ in range(_STRIDES):
             step = polish(self._frame, end, [width])
-            end = end + _STRIDE * (step - end)
+            move = step - end
+            if np.linalg.norm(move) < _AT_REST * noise * self._frame.scale:
+                break
+            end = end + _STRIDE * move
         return np.asarray(step[0])
 
     def _finalists(self, most: int, overlap: float) -> list[int]:
