@@ -17,7 +17,6 @@ from cv_densityf._arguments import real
 
 Kernel = Literal["cutoff", "gaussian"]
 
-
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
