@@ -74,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
         "--n",
         nargs="+",
         default=[None],
-        type=int,
+        type=_some,
         metavar="N",
         help="so many matches of each pair, at random; default all",
     )
@@ -167,6 +167,13 @@ def _parser() -> argparse.ArgumentParser:
 
 def _cut(text: str) -> float | str:
     return text if text == "all" else float(text)
+
+
+def _some(text: str) -> int:
+    n = int(text)
+    if n < 1:
+        raise ValueError
+    return n
 
 
 def _real(args: argparse.Namespace) -> int:

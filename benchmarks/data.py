@@ -107,7 +107,7 @@ def load_pairs(
     Raises
     ------
     ValueError
-        If the folder holds no pair, or a set does not exist.
+        If the folder holds no pair, or a set does not exist, or no pair has n matches.
     """
     paths = sorted(Path(folder).glob("*.npz"))
     if not paths:
@@ -117,7 +117,10 @@ def load_pairs(
         raise ValueError(f"no set {sorted(unknown)} in {folder}; it has {sorted(groups)}")
     limit = None if cut == "all" else float(cut)
     pairs = (_load(path, limit, seed, n) for path in paths if not sets or _group(path) in sets)
-    return [pair for pair in pairs if pair is not None]
+    loaded = [pair for pair in pairs if pair is not None]
+    if n is not None and not loaded:
+        raise ValueError(f"no pair has {n} such matches")
+    return loaded
 
 
 def _group(path: Path) -> str:

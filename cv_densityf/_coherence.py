@@ -63,7 +63,7 @@ def coherence(points1: ArrayLike, points2: ArrayLike, mask: ArrayLike | None = N
     X = check_matches(points1, points2)
     rows = np.isfinite(X).all(axis=1)
     if mask is not None:
-        inliers = np.asarray(mask)
+        inliers = np.ma.filled(mask, 0)
         if inliers.shape not in ((len(X),), (len(X), 1)):
             raise ValueError(
                 f"mask has shape {inliers.shape}; it must be ({len(X)},): one entry a match"

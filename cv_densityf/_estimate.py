@@ -305,16 +305,17 @@ def _plain(
     """Answer as cv2 itself does on the finite matches."""
     n_finite = int(np.count_nonzero(finite))
     heard = finite
-    if (robust.rule == "ransac" and n_finite < MIN_FILTERED <= len(X)) or (
-        robust.rule == "lmeds" and n_finite == _MINIMAL < len(X)
-    ):
-        # It would be another method on so few; these know rows that are not numbers.
+    if robust.rule == "ransac" and n_finite < MIN_FILTERED <= len(X):
+        # It would be another method on so few; RANSAC itself knows rows that are not numbers.
         heard = np.ones_like(finite)
     Z = X if heard.all() else X[heard]
     asked, robust = robust, robust.for_size(len(Z))
     if robust is not asked:
         reason += ", without graph cut, which takes too long here"
     F, found = robust.plain(Z[:, :2], Z[:, 2:])
+    if F is not None and len(Z) < len(X):
+        # Through seven numbers cv2 stacks all matrices there are.
+        F = F[:3]
     mask = np.zeros(len(X), dtype=bool)
     if found is not None:
         mask[heard] = found.ravel() != 0

@@ -166,8 +166,8 @@ def _read_csv(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | No
             numbers.extend([float(cell) for cell in cells])
         except ValueError:
             bad = next(cell for cell in cells if not _is_number(cell))
-            blank = ", but blank: write no index, such as pandas does" if not bad else ""
-            raise InputError(f"line {line}: {_shortened(bad)!r} is not a number{blank}") from None
+            hint = "" if cells[0] else "; is the first column an index, as pandas writes it?"
+            raise InputError(f"line {line}: {_shortened(bad)!r} is not a number{hint}") from None
     table = np.array(numbers).reshape(-1, width)
     return table[:, :4], table[:, 4] if width == 5 else None
 

@@ -41,6 +41,24 @@ def test_right_ones_are_as_exact_as_said_and_wrong_ones_crowd(seed):
     assert coherence(wrong[:, :2], wrong[:, 2:]) > coherence(wrong[:, :2], shuffled) + 0.2
 
 
+def test_hidden_places_move_as_what_is_near():
+    """Two shifts there are, of either wall; a hidden place has one of them, and its neighbours'."""
+    X = dense_matches(*walls(), np.random.default_rng(0))
+    shift = np.full((HEIGHT // TRUTH_STEP, WIDTH // TRUTH_STEP, 2), np.nan)
+    column, row = (X[:, :2] // TRUTH_STEP).astype(int).T
+    shift[row, column] = X[:, 2:] - X[:, :2]
+    focal = rendered.intrinsics()[0, 0]
+    known = -SHIFT * focal / np.array([5.0, 10.0])
+    astray = np.abs(shift[..., 1]) > 6 * dense.OWN
+    near = np.abs(shift[..., :1] - known).min(axis=-1) < 3 * dense.ASTRAY
+    assert near[astray].mean() > 0.7
+    apart = np.abs(np.diff(shift[..., 1], axis=1))[astray[:, 1:] & astray[:, :-1]]
+    assert np.nanmedian(apart) < 0.5 * dense.ASTRAY
+    some = np.abs(X[:, 3] - X[:, 1])
+    assert 0.01 < ((some > 4 * dense.OWN) & (some < 3 * dense.TAIL)).mean() < 0.2
+    assert 0.005 < (some > 5 * dense.ASTRAY).mean() < 0.1
+
+
 def test_a_cell_has_one_match_at_most():
     X = dense_matches(*walls(), np.random.default_rng(0))
     cells = np.unique(X[:, :2] // TRUTH_STEP, axis=0)

@@ -50,3 +50,12 @@ def test_windows_repeat_with_their_period():
     assert alike(100) > 0.9
     assert alike(100) > alike(90)
     assert alike(100) > alike(50)
+
+
+@pytest.mark.skipif(not find_spec("pyvista"), reason="pyvista is not installed")
+def test_dense_pairs_have_many_matches_and_no_scores(tmp_path, monkeypatch):
+    monkeypatch.setattr(motions, "SCENES", {"gallery": rendered.SCENES["gallery"]})
+    motions.write_pairs(tmp_path, repeats=1, dense=True, progress=False)
+    pairs = [pair for pair in load_pairs(tmp_path) if "gallery" in pair.name]
+    assert [pair.group for pair in pairs] == sorted(motions.MOTIONS)
+    assert all(len(pair.X) > 1500 and pair.scores is None for pair in pairs)

@@ -97,6 +97,13 @@ def test_copies_change_nothing(times):
     assert coherence(copies[:, :2], copies[:, 2:]) == pytest.approx(whole)
 
 
+def test_what_is_masked_in_the_mask_is_no_inlier():
+    scene = two_view_scene(200, inlier_ratio=0.6, random_state=0)
+    masked = np.ma.array(np.ones(200, dtype=bool), mask=~scene.inliers)
+    points = scene.points1, scene.points2
+    assert coherence(*points, masked) == coherence(*points, scene.inliers) != coherence(*points)
+
+
 def test_a_mask_of_another_length_is_refused():
     points = np.zeros((5, 2))
     with pytest.raises(ValueError, match=r"mask has shape \(4,\); it must be \(5,\)"):

@@ -613,3 +613,12 @@ def test_an_image_without_features_is_named(run, photos, tmp_path):
     code, _, err = run("match", photos[0], blank)
     assert code == 1
     assert err == f"cv-densityf: no fundamental matrix found: no features in {blank}\n"
+
+
+def test_of_many_matches_it_says_how_many_were_looked_at(run, tmp_path):
+    scene = two_view_scene(3000, inlier_ratio=0.7, random_state=0)
+    np.savez(tmp_path / "many.npz", points1=scene.points1, points2=scene.points2)
+    report = json.loads(run("match", "--points", tmp_path / "many.npz", "--json")[1])
+    assert report["n_kept"] < report["n_ranked"] < report["n_matches"] == 3000
+    text = run("match", "--points", tmp_path / "many.npz")[1]
+    assert f" {report['n_kept']} of {report['n_ranked']} " in text

@@ -689,6 +689,28 @@ def test_where_the_winner_of_many_settles_is_not_where_it_came_from(monkeypatch)
     assert settled < 0.3 * refined
 
 
+def test_a_winner_at_rest_takes_no_more_strides(monkeypatch):
+    scene = scene_of(0, n=1500, inlier_ratio=0.8)
+    X = scene.X - scene.X.mean(axis=0)
+    pool = _Pool(X, np.ones(1500), np.arange(1500), 1.0, np.random.default_rng(0))
+    F = least_squares(X[scene.inliers], eight_point(X[None, scene.inliers])[0])
+    noise = _noise(pool._frame.sampson(pool._frame.enter(F[None]))[0], 1.0)
+    rest = polish(pool._frame, pool._frame.enter(F[None]), [_consensus._STRIDE_SIGMAS * noise] * 50)
+    steps = []
+
+    def spied(*args):
+        steps.append(0)
+        return polish(*args)
+
+    monkeypatch.setattr(_consensus, "polish", spied)
+    made = []
+    for start in (rest, polish(pool._frame, pool._frame.enter(eight_point(X[None, :60])), [50.0])):
+        steps.clear()
+        pool._settled(start[0], pool._frame.sampson(start)[0])
+        made.append(len(steps))
+    assert made[0] == 1 < made[1] <= _consensus._STRIDES
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_finalists_are_the_best_three_of_different_inliers(seed, monkeypatch):
     """No two of them share .93 of the matches that either has."""

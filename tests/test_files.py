@@ -403,3 +403,15 @@ class TestReplacing:
             replacing(path) as temporary,
         ):
             temporary.write_text("new")
+
+
+@pytest.mark.parametrize(
+    ("text", "asked"),
+    [(",x1,y1,x2,y2\n0,1,2,3,4\n", True), ("x1,y1,x2,y2\n1,2,,4\n", False)],
+    ids=["index", "gap"],
+)
+def test_an_index_that_pandas_wrote_is_asked_about(tmp_path, text, asked):
+    (tmp_path / "m.csv").write_text(text)
+    with pytest.raises(InputError) as error:
+        read_matches(tmp_path / "m.csv")
+    assert ("as pandas writes it" in str(error.value)) == asked

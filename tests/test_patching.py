@@ -296,3 +296,13 @@ def test_loading_anew_leaves_a_wrapper_around_ours():
         """
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_a_patched_program_may_give_scores():
+    scores = np.where(SCENE.inliers, 2.0, 1.0) + np.arange(200) / 1000
+    expected, _ = findFundamentalMat(P1, P2, cv2.USAC_MAGSAC, 1.0, 0.999, 1000, scores=scores)
+    without, _ = findFundamentalMat(P1, P2, cv2.USAC_MAGSAC, 1.0, 0.999, 1000)
+    with patched():
+        F, _ = cv2.findFundamentalMat(P1, P2, cv2.USAC_MAGSAC, 1.0, 0.999, 1000, scores=scores)
+    np.testing.assert_array_equal(F, expected)
+    assert not np.array_equal(F, without)
