@@ -74,7 +74,7 @@ def _parser() -> argparse.ArgumentParser:
         "--n",
         nargs="+",
         default=[None],
-        type=_some,
+        type=_number,
         metavar="N",
         help="so many matches of each pair, at random; default all",
     )
@@ -169,11 +169,10 @@ def _cut(text: str) -> float | str:
     return text if text == "all" else float(text)
 
 
-def _some(text: str) -> int:
-    n = int(text)
-    if n < 1:
-        raise ValueError
-    return n
+def _number(text: str) -> int:
+    if not text.isdecimal() or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of matches")
+    return int(text)
 
 
 def _real(args: argparse.Namespace) -> int:
