@@ -7,7 +7,6 @@ cameras and truth points from the depth buffer, so that nothing in the truth com
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -76,10 +75,8 @@ def write_pairs(
         view1, *others = photograph(build, [first, *moved], rng)
         for motion, view2 in zip(MOTIONS, others, strict=True):
             path = folder / f"{motion}__{name}{repeat}.npz"
-            pair = pair_of(path.stem, view1, view2)
-            if dense:
-                pair = replace(pair, X=dense_matches(view1, view2, rng), scores=None)
-            _write(path, pair)
+            X = dense_matches(view1, view2, rng) if dense else None
+            _write(path, pair_of(path.stem, view1, view2, X))
             written.append(path)
     return written
 

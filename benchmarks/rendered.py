@@ -68,19 +68,22 @@ def render_pair(name: str) -> tuple[Pair, Image, Image]:
     return pair_of(name, view1, view2), view1.image, view2.image
 
 
-def pair_of(name: str, view1: View, view2: View) -> Pair:
-    """Match two views, and keep the truth: the pair of `render_pair`."""
+def pair_of(name: str, view1: View, view2: View, X: Floats | None = None) -> Pair:
+    """Match two views, unless the matches X (n, 4) are given, and keep the truth."""
     K = intrinsics()
     R = view2.R @ view1.R.T
     t = view2.t - R @ view1.t
     E = np.cross(np.eye(3), t).T @ R
     F = np.linalg.inv(K).T @ E @ np.linalg.inv(K)
-    matches = match_images(view1.image, view2.image)
+    scores = None
+    if X is None:
+        matches = match_images(view1.image, view2.image)
+        X, scores = matches.X, matches.scores
     return Pair(
         name=name,
         group="rendered",
-        X=matches.X,
-        scores=matches.scores,
+        X=X,
+        scores=scores,
         truth=seen_by_both(view1, view2),
         size1=SIZE,
         size2=SIZE,

@@ -75,13 +75,12 @@ def check_scores(scores: ArrayLike, n: int | None) -> NDArray[np.float64]:
 def real(values: ArrayLike, name: str) -> NDArray[np.float64]:
     """Return an array of float64, NaN for what is masked, or raise ValueError."""
     given = np.asarray(values)
-    refusal = ValueError(f"{name} is of type {given.dtype}; it must be real numbers")
-    if np.iscomplexobj(given):
-        raise refusal
     try:
+        if np.iscomplexobj(given):
+            raise TypeError
         array = np.asarray(given, dtype=np.float64)
     except TypeError:
-        raise refusal from None
+        raise ValueError(f"{name} is of type {given.dtype}; it must be real numbers") from None
     hidden = np.ma.getmask(values)
     return array if hidden is np.ma.nomask else np.where(hidden, np.nan, array)
 

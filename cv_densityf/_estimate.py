@@ -214,14 +214,14 @@ def _estimate(
     kept[rows] = support
     mask = inlier_mask(found.F, X, robust.rule, robust.threshold)
     watch.lap("mask")
-    reason = found.reason
-    if robust.rule != "lmeds" and robust.threshold > _COARSE * about[1]:
-        share = robust.threshold / about[1]
-        reason += f"; the threshold is {share:.2g} of the points' spread: are they in pixels?"
     if np.count_nonzero(mask) < _MINIMAL:
         return _plain(
             X, finite, robust, watch, "cv2's own call, since too few matches fit at this threshold"
         )
+    reason = found.reason
+    if robust.rule != "lmeds" and robust.threshold > _COARSE * about[1]:
+        share = robust.threshold / about[1]
+        reason += f"; the threshold is {share:.2g} of the points' spread: are they in pixels?"
     return Estimate(
         F=found.F,
         mask=mask,
