@@ -79,11 +79,12 @@ _LOCAL_SIZE = 14
 _LOCAL_WIDTH = 3.0
 _LOCAL_REACH = 20.0
 _LOCAL_STEPS = 2
-#: Number of samples where draws agree, or where it is hopeless.
-_LOCAL_SAMPLES = 16
-#: Where none do, the right F may be next to another hypothesis than the best: number of samples
+#: Number of samples where draws agree, or where it is hopeless, and of the best ones, which are
+#: polished.
+_LOCAL_SAMPLES = (32, 8)
+#: Where none do, the right F may be next to another hypothesis than the best: the same numbers
 #: from each of so many, whose inliers have less than this intersection over union.
-_LOCAL_SAMPLES_IN_DOUBT = 64
+_LOCAL_SAMPLES_IN_DOUBT = (96, 16)
 _LOCAL_STARTS_IN_DOUBT = 3
 _SAME_BASIN = 0.8
 #: Widths of the vote, in units of the working threshold.
@@ -437,13 +438,13 @@ class _Pool:
         vote as its score.
         """
         if self.agrees() or hopeless:
-            self._optimise_from(self.best, _LOCAL_SAMPLES)
+            self._optimise_from(self.best, *_LOCAL_SAMPLES)
         else:
             for start in self._finalists(_LOCAL_STARTS_IN_DOUBT, _SAME_BASIN):
-                self._optimise_from(start, _LOCAL_SAMPLES_IN_DOUBT)
+                self._optimise_from(start, *_LOCAL_SAMPLES_IN_DOUBT)
 
-    def _optimise_from(self, start: int, n_samples: int) -> None:
-        """Step from a hypothesis on samples of its near matches, and polish; the best one joins.
+    def _optimise_from(self, start: int, n_samples: int, n_polished: int) -> None:
+        """Step from a hypothesis on samples of its near matches, and polish the best; one joins.
 
         The matches it is not far from polish, and choose by their votes.
         """
@@ -455,8 +456,12 @@ class _Pool:
         keys = np.where(near, self._rng.random((n_samples, len(near))), np.inf)
         samples = keys < np.partition(keys, size, axis=1)[:, size, None]
         part = self._frame.part(rows)
-        widths = [np.inf, *[_POLISH_WIDTH * self.working] * _LOCAL_STEPS]
-        G = polish(part, self._G[[start]], widths, samples=samples)
+        G = polish(part, self._G[[start]], [np.inf], samples=samples)
+        # Of so many, in a hurry: without cells, and at the largest width alone.
+        widest = _VOTE_WIDTHS[-1] * self.working
+        votes = np.maximum(1.0 - part.sampson(G) / widest**2, 0.0) @ self._reliability[rows]
+        G = G[np.argsort(-votes, kind="stable")[:n_polished]]
+        G = polish(part, G, [_POLISH_WIDTH * self.working] * _LOCAL_STEPS)
         votes = self._ballot.part(rows).count(part.sampson(G), self.working) * _credit(G)
         G = G[[votes.argmax()]]
         self._append(G, *self._poll(G), [0])

@@ -39,6 +39,11 @@ METHODS: dict[str, int] = {
     "usac_magsac": cv2.USAC_MAGSAC,
 }
 
+#: Pixels, of a draw's points. cv2 asks of a sample whether it lies on a plane, within the threshold
+#: but at least within 2.8 px, and if so it tries nineteen focal lengths, which takes as long as the
+#: rest. At this scale fewer samples do, and it is for the caller to look for planes.
+_DRAW_THRESHOLD = 3.0
+
 #: cv2's graph cut takes seconds above a few tens of thousands of matches, and OpenCV 5.0 dies.
 GRAPH_CUT_MAX = 30_000
 
@@ -167,8 +172,10 @@ def draw(
     array, shape (3, 3), or None
         None where cv2 raises, or finds no finite matrix other than zero.
     """
+    scale = _DRAW_THRESHOLD / threshold
+    points = points * np.float32(scale)
     params = cv2.UsacParams()
-    params.threshold = threshold
+    params.threshold = _DRAW_THRESHOLD
     params.confidence = confidence
     params.maxIterations = max_iters
     params.randomGeneratorState = (seed + 2**31) % 2**32 - 2**31  # a signed 32-bit field
@@ -184,4 +191,5 @@ def draw(
         return None
     if F is None or not np.isfinite(F).all() or not F.any():
         return None
-    return np.asarray(F, dtype=np.float64)
+    zoom = np.array([scale, scale, 1.0])
+    return np.asarray(F * np.outer(zoom, zoom), dtype=np.float64)

@@ -67,6 +67,9 @@ def plane_and_parallax(
         coordinates = family.T @ frame.products  # of so few matches that BLAS starts no threads
         squared = (coordinates**2).sum(axis=0) / (norm[0] * (frame.scale * width) ** 2)
         plane = inliers / (1.0 + squared) ** 2
+    # By one matrix's norm, what is near its epipoles would be far off the plane.
+    norm = frame.errors(family.T.reshape(3, 3, 3))[1].mean(axis=0)
+    squared = (coordinates**2).sum(axis=0) / (norm * (frame.scale * width) ** 2)
     off_plane = squared >= 1.0
     on_plane = np.count_nonzero(inliers & ~off_plane)
     n = np.count_nonzero(off_plane)

@@ -8,6 +8,8 @@ from scipy.stats import norm
 
 from cv_densityf import _consensus, _engine, _stopwatch
 from cv_densityf._consensus import (
+    _LOCAL_SAMPLES,
+    _LOCAL_SAMPLES_IN_DOUBT,
     _Ballot,
     _doubt,
     _noise,
@@ -231,9 +233,9 @@ def test_local_optimisation_finds_more_votes_near_a_poor_hypothesis(seed):
 @pytest.mark.parametrize(
     ("sizes", "hopeless", "starts"),
     [
-        ((60, 150), False, [(0, 16)]),
-        ((60, 60), False, [(0, 64), (2, 64), (3, 64)]),
-        ((60, 60), True, [(0, 16)]),
+        ((60, 150), False, [(0, *_LOCAL_SAMPLES)]),
+        ((60, 60), False, [(i, *_LOCAL_SAMPLES_IN_DOUBT) for i in (0, 2, 3)]),
+        ((60, 60), True, [(0, *_LOCAL_SAMPLES)]),
     ],
 )
 def test_rivals_are_optimised_only_where_no_draws_agree(monkeypatch, sizes, hopeless, starts):

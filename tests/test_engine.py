@@ -215,6 +215,16 @@ def test_a_draw_finds_f_among_mostly_right_matches(scene):
     assert np.median(sampson_distance(F, true.X)) < 1.0
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_draw_does_not_depend_on_the_unit_of_length(seed):
+    """Not even where cv2 looks for a plane, which it takes to be several pixels thick."""
+    rng = np.random.default_rng(seed)
+    first = rng.uniform(-500, 500, (200, 2))
+    X = np.hstack([first, 1.1 * first + rng.normal(0, 1.0, (200, 2))]).astype(np.float32)
+    F, eighth = draw(X, 1.0, 0.999, 1000, seed), draw(X / 8, 1 / 8, 0.999, 1000, seed)
+    np.testing.assert_array_equal(eighth, F * np.outer([8, 8, 1], [8, 8, 1]))
+
+
 def test_draws_depend_on_the_seed_alone():
     hard = two_view_scene(300, inlier_ratio=0.3, noise=1.0, random_state=0).X.astype(np.float32)
     draws = [draw(hard, 1.0, 0.99, 50, seed) for seed in (0, 1, 2, 0)]
