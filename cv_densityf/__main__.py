@@ -21,11 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 import cv_densityf
-from cv_densityf._arguments import DENSITIES, DensityRule
+from cv_densityf._arguments import DENSITIES, THRESHOLDS, DensityRule
 from cv_densityf._density import density_peaks
 from cv_densityf._engine import GRAPH_CUT_MAX, METHODS, Robust, method_flag, short_name
 from cv_densityf._epipolar import Floats, residuals
-from cv_densityf._estimate import MIN_FILTERED, Estimate, estimate_fundamental, finite_in_cv2
+from cv_densityf._estimate import (
+    MIN_FILTERED,
+    MINIMAL,
+    Estimate,
+    estimate_fundamental,
+    finite_in_cv2,
+)
 from cv_densityf._files import InputError, read_matches, replacing
 from cv_densityf._prefilter import COHERENT
 from cv_densityf._run_script import add_run, run_script
@@ -39,7 +45,6 @@ from cv_densityf.matching import (
 )
 
 FOUND, NOT_FOUND, WRONG_USE = 0, 1, 2
-_MIN_MATCHES = 7
 #: Each method is timed this often, unless that takes longer than so many milliseconds.
 _TIMED_TURNS = 3
 _LONG = 1000.0
@@ -144,7 +149,11 @@ def _number(
     return parse
 
 
-_THRESHOLD = _number(float, lambda v: 1e-12 < v < 1e6, "a positive number between 1e-12 and 1e6")
+_THRESHOLD = _number(
+    float,
+    lambda v: THRESHOLDS[0] < v < THRESHOLDS[1],
+    "a positive number between {:g} and {:,.0f}".format(*THRESHOLDS),
+)
 _POSITIVE_INT = _number(int, lambda v: 0 < v < 2**31, "a positive whole number")
 _SEED = _number(int, lambda v: 0 <= v < 2**31, "a whole number from 0 to 2147483647")
 _SHARE = _number(float, lambda v: 0 < v < 1, "a number between 0 and 1")
@@ -419,10 +428,10 @@ def _run_match(options: argparse.Namespace) -> int:
     _say(json.dumps(report, allow_nan=False) if options.json else _for_people(report))
     if report["F"] is None:
         reason = "cv2's numbers are not finite" if estimate else estimate.reason
-        if n_finite < _MIN_MATCHES:
+        if n_finite < MINIMAL:
             source = options.points or " and ".join(options.images)
             finite = "" if n_finite == len(X) else "finite "
-            reason = f"{source}: {n_finite} {finite}matches, at least {_MIN_MATCHES} are needed"
+            reason = f"{source}: {n_finite} {finite}matches, at least {MINIMAL} are needed"
         if bare:
             reason = f"no features in {' and '.join(dict.fromkeys(bare))}"
         return _complain(f"no fundamental matrix found: {reason}", NOT_FOUND)

@@ -13,6 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 Density = Literal["contrast", "paper", "off"]
 DENSITIES = get_args(Density)
 
+#: Between these a threshold is one, pixels: no image is as wide as the second, so that every match
+#: would be an inlier, and there would be nothing to estimate.
+THRESHOLDS = (1e-12, 1e6)
+
 
 @dataclass(frozen=True, eq=False)
 class DensityRule:

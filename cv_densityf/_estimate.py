@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cv_densityf._arguments import (
     CONTRAST,
+    THRESHOLDS,
     Density,
     DensityRule,
     check,
@@ -44,7 +45,7 @@ MAX_RANKED = 1_000
 _SEARCH_THRESHOLD = 0.01
 _LEEWAY = 2.0
 #: An F that explains fewer matches than a minimal sample is none.
-_MINIMAL = 7
+MINIMAL = 7
 #: A larger threshold, in units of the points' spread, is hardly meant.
 _COARSE = 0.1
 #: cv2's direct kernels take every match as true.
@@ -214,7 +215,7 @@ def _estimate(
     kept[rows] = support
     mask = inlier_mask(found.F, X, robust.rule, robust.threshold)
     watch.lap("mask")
-    if np.count_nonzero(mask) < _MINIMAL:
+    if np.count_nonzero(mask) < MINIMAL:
         return _plain(
             X, finite, robust, watch, "cv2's own call, since too few matches fit at this threshold"
         )
@@ -323,8 +324,8 @@ def _plain(
     name = method_name(robust)
     if F is None:
         why = "they may be too few or degenerate"
-        if n_finite < _MINIMAL:
-            why = f"at least {_MINIMAL} are needed"
+        if n_finite < MINIMAL:
+            why = f"at least {MINIMAL} are needed"
         reason += f"; {name} found no F in {n_finite} finite matches: {why}"
     return Estimate(
         F=F,
@@ -412,9 +413,9 @@ def estimate_fundamental(
     """
     X = check_matches(points1, points2)
     trust = None if scores is None else check_scores(scores, len(X))
-    check(
-        "threshold", threshold, Real, lambda v: 1e-12 < v < 1e6, "a number above 1e-12, below 1e6"
-    )
+    low, high = THRESHOLDS
+    wanted = f"a number above {low:g}, below {high:,.0f}"
+    check("threshold", threshold, Real, lambda v: low < v < high, wanted)
     check("confidence", confidence, Real, lambda v: 0 < v < 1, "a number inside (0, 1)")
     check(
         "max_iters", max_iters, Integral, lambda v: 1 <= v < 2**31, "an integer from 1 to 2^31 - 1"

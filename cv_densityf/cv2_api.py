@@ -12,7 +12,7 @@ import numpy as np
 from cv2.typing import MatLike
 from numpy.typing import ArrayLike, NDArray
 
-from cv_densityf._arguments import Density, DensityRule, check_scores
+from cv_densityf._arguments import THRESHOLDS, Density, DensityRule, check_scores
 from cv_densityf._engine import Robust, cuts_graph, is_usac, original, without_graph_cut
 from cv_densityf._epipolar import inlier_mask
 from cv_densityf._estimate import LOG, MIN_FILTERED, Estimate, run
@@ -37,9 +37,6 @@ _FLOAT32_EPSILON = float(np.finfo(np.float32).eps)
 
 #: cv2 leaves masks of these types alone, and answers with one of its own.
 _IGNORED_MASKS = frozenset(np.dtype(t) for t in ("i1", "i2", "u2", "i4", "f4", "f8"))
-
-#: No image is this wide: every match is an inlier, and there is nothing to estimate.
-_MAX_THRESHOLD = 1e6
 
 
 @overload
@@ -388,7 +385,7 @@ def _is_ordinary(call: Call) -> bool:
         magsac = params.score == cv2.SCORE_METHOD_MAGSAC
     lowest = _MAGSAC_MIN_THRESHOLD if magsac else 0.0
     return (
-        (lowest < call.threshold < _MAX_THRESHOLD or call.method == cv2.FM_LMEDS)
+        (lowest < call.threshold < THRESHOLDS[1] or call.method == cv2.FM_LMEDS)
         and 0.0 < call.confidence < 1.0
         and call.max_iters > 0
     )

@@ -29,7 +29,7 @@ from sklearn.utils.validation import (
 )
 
 from cv_densityf import _epipolar
-from cv_densityf._arguments import OFF
+from cv_densityf._arguments import OFF, THRESHOLDS
 from cv_densityf._density import checked_points, density_peaks
 from cv_densityf._display import DecisionGraphDisplay
 from cv_densityf._engine import METHODS, Robust, method_flag
@@ -55,6 +55,15 @@ def _validated_matches(estimator: Any, X: ArrayLike, **options: Any) -> NDArray[
     if matches.shape[1] != 4:
         raise ValueError(f"X must have 4 columns, {_COLUMNS}; it has {matches.shape[1]}")
     return np.asarray(matches)
+
+
+def _validated_weight(
+    sample_weight: ArrayLike | None, matches: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """Validate the weights of matches, if there are any, as scikit-learn does."""
+    if sample_weight is None:
+        return None
+    return np.asarray(_check_sample_weight(sample_weight, matches, dtype=np.float64))
 
 
 class DensityPeaks(ClusterMixin, BaseEstimator):  # type: ignore[misc]
@@ -324,11 +333,7 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
         self._validate_params()
         matches = self._validated(X)
         n = len(matches)
-        weight = (
-            None
-            if sample_weight is None
-            else _check_sample_weight(sample_weight, matches, dtype=np.float64)
-        )
+        weight = _validated_weight(sample_weight, matches)
         reliability: NDArray[np.floating]
         if n >= MIN_FILTERED and self.rule == "contrast":
             reliability, support, _ = contrast_support(checked_points(matches), weight)
@@ -509,7 +514,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "prefilter": [StrOptions({"auto"}), HasMethods("fit_predict"), None],
         "method": [str, Integral],
-        "threshold": [Interval(Real, 1e-12, 1e6, closed="neither")],
+        "threshold": [Interval(Real, *THRESHOLDS, closed="neither")],
         "confidence": [Interval(Real, 0, 1, closed="neither")],
         "max_iters": [Interval(Integral, 1, 2**31 - 1, closed="both")],
         "random_state": ["random_state"],
@@ -576,11 +581,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
             int(self.max_iters),
         )  # fmt: skip
         matches = self._validated(X, ensure_min_samples=8)
-        weight = (
-            None
-            if sample_weight is None
-            else _check_sample_weight(sample_weight, matches, dtype=np.float64)
-        )
+        weight = _validated_weight(sample_weight, matches)
         prefilter_params = self._prefilter_params(weight, params)
 
         self.prefilter_: Any = None
