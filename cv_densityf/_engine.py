@@ -41,8 +41,9 @@ METHODS: dict[str, int] = {
 
 #: Pixels, of a draw's points. cv2 asks of a sample whether it lies on a plane, within the threshold
 #: but at least within 2.8 px, and if so it tries nineteen focal lengths, which takes as long as the
-#: rest. At this scale fewer samples do, and it is for the caller to look for planes.
-_DRAW_THRESHOLD = 3.0
+#: rest. At a scale at which the threshold is no smaller than this, fewer samples do, and it is for
+#: the caller to look for planes.
+_LEAST_DRAW_THRESHOLD = 3.0
 
 #: cv2's graph cut takes seconds above a few tens of thousands of matches, and OpenCV 5.0 dies.
 GRAPH_CUT_MAX = 30_000
@@ -172,10 +173,10 @@ def draw(
     array, shape (3, 3), or None
         None where cv2 raises, or finds no finite matrix other than zero.
     """
-    scale = _DRAW_THRESHOLD / threshold
+    scale = max(1.0, _LEAST_DRAW_THRESHOLD / threshold)
     points = points * np.float32(scale)
     params = cv2.UsacParams()
-    params.threshold = _DRAW_THRESHOLD
+    params.threshold = scale * threshold
     params.confidence = confidence
     params.maxIterations = max_iters
     params.randomGeneratorState = (seed + 2**31) % 2**32 - 2**31  # a signed 32-bit field
