@@ -230,6 +230,32 @@ def test_local_optimisation_finds_more_votes_near_a_poor_hypothesis(seed):
     assert not pool.agrees()
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+def test_of_the_samples_the_best_are_polished(monkeypatch, seed):
+    """Those with most right matches near their lines, and no others."""
+    scene = scene_of(seed)
+    pool = _Pool(
+        scene.X, np.ones(len(scene.X)), np.arange(len(scene.X)), 1.0, np.random.default_rng(0)
+    )
+    pool.add(scene.F[None], [50])
+    seen = []
+
+    def spy(frame, G, scales, samples=None):
+        made = polish(frame, G, scales, samples)
+        seen.append((frame.leave(G), frame.leave(made)))
+        return made
+
+    monkeypatch.setattr(_consensus, "polish", spy)
+    pool.optimise(hopeless=True)
+    (_, sampled), (polished, _) = seen
+    assert (len(sampled), len(polished)) == _LOCAL_SAMPLES
+    right = scene.X[scene.inliers]
+    chosen, all_ = (
+        [np.mean(sampson_distance(F, right) < 1) for F in made] for made in (polished, sampled)
+    )
+    assert np.min(chosen) > np.median(all_)
+
+
 @pytest.mark.parametrize(
     ("sizes", "hopeless", "starts"),
     [
