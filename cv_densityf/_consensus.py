@@ -457,7 +457,7 @@ class _Pool:
         samples = keys < np.partition(keys, size, axis=1)[:, size, None]
         part = self._frame.part(rows)
         G = polish(part, self._G[[start]], [np.inf], samples=samples)
-        # Of so many, in a hurry: without cells, and at the largest width alone.
+        # Of so many, in a hurry: without cells and cameras, and at the largest width alone.
         widest = _VOTE_WIDTHS[-1] * self.working
         votes = np.maximum(1.0 - part.sampson(G) / widest**2, 0.0) @ self._reliability[rows]
         G = G[np.argsort(-votes, kind="stable")[:n_polished]]

@@ -44,7 +44,7 @@ MAX_RANKED = 1_000
 #: factor of the caller's; below half of it, right matches may not agree any more.
 _SEARCH_THRESHOLD = 0.01
 _LEEWAY = 2.0
-#: An F that explains fewer matches than a minimal sample is none.
+#: Matches of a minimal sample: fewer have no F, and an F that explains fewer is none.
 MINIMAL = 7
 #: A larger threshold, in units of the points' spread, is hardly meant.
 _COARSE = 0.1

@@ -67,7 +67,8 @@ def plane_and_parallax(
         coordinates = family.T @ frame.products  # of so few matches that BLAS starts no threads
         squared = (coordinates**2).sum(axis=0) / (norm[0] * (frame.scale * width) ** 2)
         plane = inliers / (1.0 + squared) ** 2
-    # By one matrix's norm, what is near its epipoles would be far off the plane.
+    # By the norm of one matrix, what is near its epipoles would be far off the plane; the mean over
+    # the family is small nowhere.
     norm = frame.errors(family.T.reshape(3, 3, 3))[1].mean(axis=0)
     squared = (coordinates**2).sum(axis=0) / (norm * (frame.scale * width) ** 2)
     off_plane = squared >= 1.0

@@ -383,7 +383,7 @@ def _is_ordinary(call: Call) -> bool:
         ):
             return False
         magsac = params.score == cv2.SCORE_METHOD_MAGSAC
-    lowest = _MAGSAC_MIN_THRESHOLD if magsac else 0.0
+    lowest = _MAGSAC_MIN_THRESHOLD if magsac else THRESHOLDS[0]
     return (
         (lowest < call.threshold < THRESHOLDS[1] or call.method == cv2.FM_LMEDS)
         and 0.0 < call.confidence < 1.0

@@ -232,7 +232,7 @@ def test_local_optimisation_finds_more_votes_near_a_poor_hypothesis(seed):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_of_the_samples_the_best_are_polished(monkeypatch, seed):
-    """Those with most right matches near their lines, and no others."""
+    """They have more right matches near their lines than half of all."""
     scene = scene_of(seed)
     pool = _Pool(
         scene.X, np.ones(len(scene.X)), np.arange(len(scene.X)), 1.0, np.random.default_rng(0)
