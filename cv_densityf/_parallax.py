@@ -65,13 +65,11 @@ def plane_and_parallax(
     for _ in range(_STEPS):
         family = np.linalg.eigh(frame.gram(plane / norm))[1][0, :, :3]
         coordinates = family.T @ frame.products  # of so few matches that BLAS starts no threads
-        squared = (coordinates**2).sum(axis=0) / (norm[0] * (frame.scale * width) ** 2)
-        plane = inliers / (1.0 + squared) ** 2
+        squared = (coordinates**2).sum(axis=0) / (frame.scale * width) ** 2
+        plane = inliers / (1.0 + squared / norm[0]) ** 2
     # By the norm of one matrix, what is near its epipoles would be far off the plane; the mean over
     # the family is small nowhere.
-    norm = frame.errors(family.T.reshape(3, 3, 3))[1].mean(axis=0)
-    squared = (coordinates**2).sum(axis=0) / (norm * (frame.scale * width) ** 2)
-    off_plane = squared >= 1.0
+    off_plane = squared > frame.errors(family.T.reshape(3, 3, 3))[1].mean(axis=0)
     on_plane = np.count_nonzero(inliers & ~off_plane)
     n = np.count_nonzero(off_plane)
     if on_plane < max(FEWEST, _DOMINANT * np.count_nonzero(inliers)) or n < 2:
