@@ -30,7 +30,9 @@ TEST_TOOLS = ("hypothesis", "pytest", "pytest-timeout")
 #: Release of OpenCV, the numpy to run it with, Pythons. Wheels before 4.10 need numpy 1.
 MATRIX = [
     ("4.8.1.78", "numpy==1.26.4", ("3.11", "3.12")),
+    ("4.9.0.80", "numpy==1.26.4", ("3.11",)),
     ("4.10.0.84", "numpy==2.0.2", ("3.11",)),
+    ("4.11.0.86", "numpy>=2", ("3.11",)),
     ("4.12.0.88", "numpy<2.3", ("3.11",)),
     ("4.13.0.92", "numpy>=2", ("3.11",)),
     ("4.14.0.94", "numpy>=2", ("3.11", "3.12", "3.13")),
