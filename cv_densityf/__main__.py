@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 import cv_densityf
 from cv_densityf._arguments import DENSITIES, THRESHOLDS, DensityRule
-from cv_densityf._density import density_peaks
-from cv_densityf._engine import GRAPH_CUT_MAX, METHODS, Robust, method_flag, short_name
+from cv_densityf._engine import METHODS, Robust, method_flag, short_name
 from cv_densityf._epipolar import Floats, residuals
 from cv_densityf._estimate import (
     MIN_FILTERED,
@@ -208,10 +207,18 @@ def _add_match(commands: argparse._SubParsersAction[Any]) -> None:
     estimate = match.add_argument_group("estimate")
     _add_method(estimate, 1.0)
     estimate.add_argument(
-        "--confidence", metavar="P", type=_SHARE, default=0.999, help="(%(default)s)"
+        "--confidence",
+        metavar="P",
+        type=_SHARE,
+        default=0.999,
+        help="of each draw to have found the best F (%(default)s)",
     )
     estimate.add_argument(
-        "--max-iters", metavar="N", type=_POSITIVE_INT, default=5000, help="(%(default)s)"
+        "--max-iters",
+        metavar="N",
+        type=_POSITIVE_INT,
+        default=5000,
+        help="most samples of a draw, of which the default rule's takes 1000 (%(default)s)",
     )
     estimate.add_argument(
         "--density",
@@ -223,7 +230,9 @@ def _add_match(commands: argparse._SubParsersAction[Any]) -> None:
     estimate.add_argument(
         "--alpha", metavar="A", type=_ALPHA, help=f"of --density paper ({DensityRule.alpha})"
     )
-    estimate.add_argument("--seed", metavar="N", type=_SEED, default=0, help="(%(default)s)")
+    estimate.add_argument(
+        "--seed", metavar="N", type=_SEED, default=0, help="of the random samples (%(default)s)"
+    )
     matching = match.add_argument_group("matching, for images")
     matching.add_argument(
         "--ratio",
@@ -266,7 +275,11 @@ def _add_demo(commands: argparse._SubParsersAction[Any]) -> None:
         "draw what was done. Needs no network.",
     )
     demo.add_argument(
-        "--out", type=Path, default=Path("cv-densityf-demo"), metavar="DIR", help="(%(default)s)"
+        "--out",
+        type=Path,
+        default=Path("cv-densityf-demo"),
+        metavar="DIR",
+        help="folder for the pictures (%(default)s)",
     )
     demo.set_defaults(run=_run_demo, error=demo.error)
 
@@ -382,9 +395,6 @@ def _run_match(options: argparse.Namespace) -> int:
     robust = Robust(
         method_flag(options.method), options.threshold, options.confidence, options.max_iters
     )
-    if robust.best_first and scores is not None:
-        order = np.argsort(-scores, kind="stable")
-        X, scores = X[order], scores[order]
     calls: dict[str, Callable[[], Any]] = {
         "estimating": lambda: estimate_fundamental(
             X[:, :2],
@@ -401,13 +411,14 @@ def _run_match(options: argparse.Namespace) -> int:
     }
     n_finite = int(finite_in_cv2(X).sum())
     same_call = n_finite == len(X) and (
-        options.density == "off"
-        or options.method in ("7point", "8point")
-        or n_finite < MIN_FILTERED
+        options.density == "off" or robust.direct or n_finite < MIN_FILTERED
     )
-    compared = options.method != "usac_accurate" or len(X) <= GRAPH_CUT_MAX
+    compared = robust.for_size(len(X)) is robust
+    ordered = X
+    if robust.best_first and scores is not None:
+        ordered = X[np.argsort(-scores, kind="stable")]
     if compared and not same_call:
-        calls["plain cv2"] = lambda: robust.plain(X[:, :2], X[:, 2:])
+        calls["plain cv2"] = lambda: robust.plain(ordered[:, :2], ordered[:, 2:])
     with _stage("estimating", timings):
         results, processor = _timed(calls)
     timings.update(processor)
@@ -416,7 +427,7 @@ def _run_match(options: argparse.Namespace) -> int:
     if compared and same_call:
         plain = _plain_report(X, robust, estimate.F, estimate.mask)
     elif compared:
-        plain = _plain_report(X, robust, *results["plain cv2"])
+        plain = _plain_report(ordered, robust, *results["plain cv2"])
     if options.plot is not None and estimate.F is not None and len(estimate.F) > 3:
         raise InputError("seven matches fit several matrices, and --plot draws the lines of one")
     report = {
@@ -555,9 +566,10 @@ def _for_people(report: dict[str, Any]) -> str:
     for name, text in (("elapsed, ms", named), ("how", report["reason"])):
         start, indent = f"{name:<22}  ", " " * 24
         lines.append(textwrap.fill(text, 79, initial_indent=start, subsequent_indent=indent))
-    coherence = report["coherence"]
-    few = 2 * report["n_inliers"] <= report["n_matches"]
-    if coherence is not None and coherence < COHERENT and few:
+    coherence, n_inliers = report["coherence"], report["n_inliers"]
+    if report["F"] is not None and n_inliers <= MINIMAL + 1:
+        lines += ["", f"Some F fits any {MINIMAL} matches: so few inliers say nothing."]
+    elif coherence is not None and coherence < COHERENT and 2 * n_inliers <= n:
         lines += ["", "Images that have nothing in common have inliers of such coherence."]
     if report["F"] is not None:
         rows_of_F = ["  " + "".join(f"{value:>18.9e}" for value in row) for row in report["F"]]
@@ -615,6 +627,7 @@ def _draw(
     alpha: float | None,
 ) -> None:
     from cv_densityf import plotting
+    from cv_densityf._density import density_peaks
 
     rows = np.flatnonzero(finite_in_cv2(X))
     n_finite = len(rows)
@@ -637,6 +650,7 @@ def _draw(
 
 def _run_demo(options: argparse.Namespace) -> int:
     from cv_densityf import datasets, plotting
+    from cv_densityf._density import density_peaks
 
     if options.out.exists() and not options.out.is_dir():
         options.error(f"--out takes a folder, and {options.out} is a file")
@@ -761,10 +775,15 @@ def _run_verify(options: argparse.Namespace) -> int:
     return FOUND if done.n_verified or (done.n_before and not done.failures) else NOT_FOUND
 
 
+def _opencv_packages() -> list[str]:
+    """Name the packages that bring a ``cv2``: of two, the last one installed has it."""
+    return sorted(set(metadata.packages_distributions().get("cv2", ())))
+
+
 def _run_version(options: argparse.Namespace) -> int:
     _say(f"cv-densityf {cv_densityf.__version__}")
-    _say(f"opencv {cv2.__version__}")
-    for name in ("numpy", "scipy", "scikit-learn", "matplotlib", "scikit-image"):
+    _say(f"opencv {cv2.__version__}, from {' and '.join(_opencv_packages()) or 'no package'}")
+    for name in ("numpy", "scipy", "scikit-learn", "joblib", "matplotlib", "scikit-image"):
         try:
             _say(f"{name} {metadata.version(name)}")
         except metadata.PackageNotFoundError:

@@ -76,14 +76,27 @@ def check_scores(scores: ArrayLike, n: int | None) -> NDArray[np.float64]:
     return trust.ravel()
 
 
+def check_mask(mask: ArrayLike, n: int, name: str) -> NDArray[np.bool_]:
+    """Return the mask of n matches as (n,) bool, False for what is masked, or raise ValueError."""
+    given = real(np.ma.filled(mask, 0), name)
+    if given.shape not in ((n,), (n, 1)):
+        raise ValueError(f"{name} has shape {given.shape}; it must be ({n},): one entry a match")
+    if not (given >= 0).all():
+        raise ValueError(f"{name} has negative numbers or NaN; of -1 and 1, pass `{name} > 0`")
+    return np.asarray(given.ravel() > 0)
+
+
 def real(values: ArrayLike, name: str) -> NDArray[np.float64]:
     """Return an array of float64, NaN for what is masked, or raise ValueError."""
-    given = np.asarray(values)
     try:
-        if np.iscomplexobj(given):
+        given = np.asarray(values)
+    except ValueError:
+        raise ValueError(f"{name} has rows of different length") from None
+    try:
+        if given.dtype.kind not in "biufO":
             raise TypeError
         array = np.asarray(given, dtype=np.float64)
-    except TypeError:
+    except (TypeError, ValueError):
         raise ValueError(f"{name} is of type {given.dtype}; it must be real numbers") from None
     hidden = np.ma.getmask(values)
     return array if hidden is np.ma.nomask else np.where(hidden, np.nan, array)

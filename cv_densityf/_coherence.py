@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cv_densityf import _prefilter
-from cv_densityf._arguments import check_matches
+from cv_densityf._arguments import check_mask, check_matches
 
 
 def coherence(points1: ArrayLike, points2: ArrayLike, mask: ArrayLike | None = None) -> float:
@@ -35,7 +35,7 @@ def coherence(points1: ArrayLike, points2: ArrayLike, mask: ArrayLike | None = N
     Raises
     ------
     ValueError
-        If shapes differ.
+        If shapes differ, or the mask holds negative numbers or NaN.
 
     See Also
     --------
@@ -63,10 +63,5 @@ def coherence(points1: ArrayLike, points2: ArrayLike, mask: ArrayLike | None = N
     X = check_matches(points1, points2)
     rows = np.isfinite(X).all(axis=1)
     if mask is not None:
-        inliers = np.ma.filled(mask, 0)
-        if inliers.shape not in ((len(X),), (len(X), 1)):
-            raise ValueError(
-                f"mask has shape {inliers.shape}; it must be ({len(X)},): one entry a match"
-            )
-        rows &= inliers.ravel() != 0
+        rows &= check_mask(mask, len(X), "mask")
     return _prefilter.coherence(X[rows])

@@ -231,8 +231,8 @@ def search(
         # Draws that have the same inliers may have another F.
         agreed = False
         reason += (
-            f"; {planar:.0%} of its inliers suit one plane, or a camera that only turned, and the "
-            "others are no more than by chance, which leaves F open"
+            f"; {planar:.0%} of its inliers suit one plane, or a camera that only turned, which "
+            "leaves F open"
         )
     return Consensus(F, reliability, tuple(pool.votes.tolist()), n_draws, agreed, reason)
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from numbers import Integral
-from typing import Literal
+from numbers import Integral, Real
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist, pdist
 
-from cv_densityf._arguments import real
+from cv_densityf._arguments import check, real
 
 Kernel = Literal["cutoff", "gaussian"]
 
@@ -249,14 +249,14 @@ def density_peaks(
     array([40, 60])
     """
     X = checked_points(X)
-    if dc is not None and not 0 < dc < math.inf:
-        raise ValueError(f"dc is a distance, finite and greater than 0; got {dc}")
-    if not 0 < dc_percent <= 100:
-        raise ValueError(f"dc_percent is a percentage in (0, 100]; got {dc_percent}")
-    if kernel not in ("cutoff", "gaussian"):
-        raise ValueError(f"kernel must be 'cutoff' or 'gaussian'; got {kernel!r}")
-    if sample_size is not None and not (isinstance(sample_size, Integral) and sample_size >= 2):
-        raise ValueError(f"sample_size is a number of points, at least 2; got {sample_size!r}")
+    if dc is not None:
+        check("dc", dc, Real, lambda v: 0 < v < math.inf, "a distance, finite and above 0")
+    check("dc_percent", dc_percent, Real, lambda v: 0 < v <= 100, "a percentage in (0, 100]")
+    kernels = get_args(Kernel)
+    check("kernel", kernel, str, kernels.__contains__, " or ".join(map(repr, kernels)))
+    if sample_size is not None:
+        wanted = "a number of points, at least 2"
+        check("sample_size", sample_size, Integral, lambda v: v >= 2, wanted)
 
     n = len(X)
     if dc is None:

@@ -138,10 +138,14 @@ class DecisionGraphDisplay:
         ------
         sklearn.exceptions.NotFittedError
             If the estimator is not fitted.
+        TypeError
+            If it has no decision graph.
         """
         from sklearn.utils.validation import check_is_fitted
 
-        check_is_fitted(estimator, "rho_")
+        check_is_fitted(estimator)
+        if not hasattr(estimator, "rho_"):
+            raise TypeError(f"{type(estimator).__name__} has no decision graph; DensityPeaks has")
         return cls.from_arrays(
             estimator.rho_,
             estimator.delta_,

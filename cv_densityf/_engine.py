@@ -38,6 +38,7 @@ METHODS: dict[str, int] = {
     "usac_prosac": cv2.USAC_PROSAC,
     "usac_magsac": cv2.USAC_MAGSAC,
 }
+_NAMES = {flag: name for name, flag in METHODS.items()}
 
 #: Pixels, of a draw's points. cv2 asks of a sample whether it lies on a plane, within the threshold
 #: but at least within 2.8 px, and if so it tries nineteen focal lengths, which takes as long as the
@@ -71,14 +72,6 @@ def method_flag(method: str | int) -> int:
     elif isinstance(method, Integral) and type(method) is not bool and method in METHODS.values():
         return int(method)
     raise ValueError(f"unknown method {method!r}; choose one of {', '.join(METHODS)}")
-
-
-def method_name(robust: Robust) -> str:
-    """Name of the method that cv2 will run."""
-    if robust.params is not None:
-        return "usac"
-    names = {flag: name for name, flag in METHODS.items()}
-    return names.get(robust.flag, "lmeds")
 
 
 def is_usac(flag: int) -> bool:
@@ -118,11 +111,21 @@ class Robust:
     params: cv2.UsacParams | None = None
 
     @property
+    def name(self) -> str:
+        """Name of the method that cv2 will run."""
+        return "usac" if self.params is not None else _NAMES[self.flag]
+
+    @property
+    def direct(self) -> bool:
+        """Whether the method takes every match as true."""
+        return self.params is None and self.flag in (cv2.FM_7POINT, cv2.FM_8POINT)
+
+    @property
     def rule(self) -> Rule:
         """The rule by which cv2 makes this method's mask."""
         if self.params is not None or is_usac(self.flag):
             return "usac"
-        return "ransac" if self.flag & ~3 == cv2.FM_RANSAC else "lmeds"
+        return "ransac" if self.flag == cv2.FM_RANSAC else "lmeds"
 
     @property
     def best_first(self) -> bool:
@@ -141,14 +144,10 @@ class Robust:
     def plain(
         self, points1: Any, points2: Any
     ) -> tuple[NDArray[np.float64] | None, NDArray[np.uint8] | None]:
-        """Make cv2's own call; (None, None) where its solver raises or finds nothing.
-
-        The settings are those `for_size`.
-        """
-        asked = self.for_size(len(points1))
-        third: tuple[Any, ...] = (asked.flag, asked.threshold, asked.confidence, asked.max_iters)
-        if asked.params is not None:
-            third = (asked.params,)
+        """Make cv2's own call; (None, None) where its solver raises or finds nothing."""
+        third: tuple[Any, ...] = (self.flag, self.threshold, self.confidence, self.max_iters)
+        if self.params is not None:
+            third = (self.params,)
         try:
             F, mask = original(points1, points2, *third)
         except cv2.error:

@@ -77,13 +77,17 @@ def inlier_mask(F: Floats, X: Floats, rule: Rule, threshold: float) -> NDArray[n
         if rule == "usac":
             error = _sampson_squared(F.astype(np.float32), X.astype(np.float32))
             return np.asarray(error.astype(np.float64) < threshold * threshold)
-        error = point_line_squared(F, X).astype(np.float32)
         if rule == "lmeds":
-            threshold = _lmeds_threshold(error[np.isfinite(error)])
+            threshold = lmeds_threshold(F, X)
+        error = point_line_squared(F, X).astype(np.float32)
         return np.asarray(error <= np.float32(threshold * threshold))
 
 
-def _lmeds_threshold(error: Floats) -> float:
+def lmeds_threshold(F: Floats, X: Floats) -> float:
+    """Largest residual of an inlier by the rule ``"lmeds"``, pixels."""
+    with np.errstate(all="ignore"):
+        error = point_line_squared(F, X).astype(np.float32)
+    error = error[np.isfinite(error)]
     n = len(error)
     if n <= 7:
         return _LMEDS_MIN_SIGMA

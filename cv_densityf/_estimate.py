@@ -21,7 +21,7 @@ from cv_densityf._arguments import (
     check_scores,
 )
 from cv_densityf._consensus import eight_point_ransac, search
-from cv_densityf._engine import Robust, method_flag, method_name
+from cv_densityf._engine import Robust, method_flag
 from cv_densityf._epipolar import FAR, inlier_mask, middle
 from cv_densityf._prefilter import best_scored, contrast_support, paper_support
 from cv_densityf._stopwatch import Stopwatch
@@ -48,8 +48,6 @@ _LEEWAY = 2.0
 MINIMAL = 7
 #: A larger threshold, in units of the points' spread, is hardly meant.
 _COARSE = 0.1
-#: cv2's direct kernels take every match as true.
-_DIRECT = (1, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,12 +152,14 @@ def _estimate(
     n, density = len(X), rule.density
     finite = finite_in_cv2(X)
     rows = np.flatnonzero(finite)
-    direct = robust.flag in _DIRECT
-    if density == "off" or direct or len(rows) < MIN_FILTERED:
-        why = "density is off" if density == "off" else f"{method_name(robust)} takes no filter"
-        if len(rows) < MIN_FILTERED:
-            why = f"fewer than {MIN_FILTERED} finite matches"
-        return _plain(X, finite, robust, watch, f"cv2's own call, since {why}")
+
+    def plain(why: str) -> Estimate:
+        return _plain(X, finite, scores, robust, watch, f"cv2's own call, since {why}")
+
+    if len(rows) < MIN_FILTERED:
+        return plain(f"fewer than {MIN_FILTERED} finite matches")
+    if density == "off" or robust.direct:
+        return plain("density is off" if density == "off" else f"{robust.name} takes no filter")
     heard = rows
     if len(rows) > MAX_SEARCHED:
         rng = np.random.default_rng(abs(seed))
@@ -168,13 +168,7 @@ def _estimate(
     Z = X[rows] if len(rows) < n else X
     about = middle(Z)
     if _on_a_line(Z, about):
-        return _plain(
-            X,
-            finite,
-            robust,
-            watch,
-            "cv2's own call, since all points of an image are nearly on a line",
-        )
+        return plain("all points of an image are nearly on a line")
     trust = None if scores is None else scores[rows]
     if trust is None and robust.best_first:
         trust = -rows.astype(np.float64)
@@ -206,9 +200,7 @@ def _estimate(
         except np.linalg.LinAlgError:
             found = None
     if found is None:
-        return _plain(
-            X, finite, robust, watch, "cv2's own call, since no draw on the dense part held"
-        )
+        return plain("no draw on the dense part held")
     reliability = np.full(n, np.nan)
     reliability[rows] = r
     kept = np.zeros(n, dtype=bool)
@@ -216,9 +208,7 @@ def _estimate(
     mask = inlier_mask(found.F, X, robust.rule, robust.threshold)
     watch.lap("mask")
     if np.count_nonzero(mask) < MINIMAL:
-        return _plain(
-            X, finite, robust, watch, "cv2's own call, since too few matches fit at this threshold"
-        )
+        return plain("too few matches fit at this threshold")
     reason = found.reason
     if robust.rule != "lmeds" and robust.threshold > _COARSE * about[1]:
         share = robust.threshold / about[1]
@@ -299,17 +289,21 @@ def _on_a_line(X: NDArray[np.float64], about: tuple[NDArray[np.floating], float]
 def _plain(
     X: NDArray[np.float64],
     finite: NDArray[np.bool_],
+    scores: NDArray[np.float64] | None,
     robust: Robust,
     watch: Stopwatch,
     reason: str,
 ) -> Estimate:
-    """Answer as cv2 itself does on the finite matches."""
+    """Answer as cv2 itself does on the finite matches, PROSAC with the best scores first."""
     n_finite = int(np.count_nonzero(finite))
     heard = finite
     if robust.rule == "ransac" and n_finite < MIN_FILTERED <= len(X):
         # It would be another method on so few; RANSAC itself knows rows that are not numbers.
         heard = np.ones_like(finite)
-    Z = X if heard.all() else X[heard]
+    rows = np.flatnonzero(heard)
+    if scores is not None and robust.best_first:
+        rows = rows[np.argsort(-scores[rows], kind="stable")]
+    Z = X[rows]
     asked, robust = robust, robust.for_size(len(Z))
     if robust is not asked:
         reason += ", without graph cut, which takes too long here"
@@ -319,9 +313,9 @@ def _plain(
         F = F[:3]
     mask = np.zeros(len(X), dtype=bool)
     if found is not None:
-        mask[heard] = found.ravel() != 0
+        mask[rows] = found.ravel() != 0
     watch.lap("draws")
-    name = method_name(robust)
+    name = robust.name
     if F is None:
         why = "they may be too few or degenerate"
         if n_finite < MINIMAL:
@@ -384,7 +378,8 @@ def estimate_fundamental(
         For ``"paper"``: mean share of neighbours within the cut-off distance, percent, (0, 100].
     scores : array-like, shape (n,) or (n, 1), optional
         Trust in each match, higher is better (1 - SIFT ratio, a matcher's confidence). Only the
-        order counts, so infinities will do, but not NaN. ``"paper"`` and ``"off"`` use none.
+        order counts, so infinities will do, but not NaN. ``"paper"`` and ``"off"`` use none, but
+        cv2's own PROSAC gets the best first.
     random_state : int
         Seed, in [0, 2^31).
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import os
+import shutil
 import zipfile
 from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
+from uuid import uuid4
 
 import numpy as np
 from numpy.lib.format import MAGIC_PREFIX
@@ -232,9 +234,11 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         If it cannot be written, with ``path`` as its file name.
     """
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{target.stem}-{os.getpid()}{target.suffix}")
+    temporary = target.with_name(f".{target.stem}-{uuid4().hex}{target.suffix}")
     try:
         yield temporary
+        if target.exists():
+            shutil.copymode(target, temporary)
         os.replace(temporary, target)
     except OSError as error:
         # The temporary name would tell the caller nothing.

@@ -89,17 +89,14 @@ def resolve(args: tuple[Any, ...], kwargs: dict[str, Any]) -> Call | None:
 def _bind(
     names: tuple[str, ...], n_required: int, args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> dict[str, Any] | None:
-    if len(args) > len(names) or len(args) + len(kwargs) < n_required:
+    if len(args) > len(names):
         return None
     bound = dict(zip(names, args, strict=False))
     for name, value in kwargs.items():
         if name in bound or name not in names:
             return None
         bound[name] = value
-    for name in names[len(args) : n_required]:
-        if name not in bound:
-            return None
-    return bound
+    return bound if bound.keys() >= set(names[:n_required]) else None
 
 
 def _as_int(value: Any, if_none: int) -> int | None:

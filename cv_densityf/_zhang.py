@@ -95,7 +95,7 @@ def _one_way(
         draws = rng.random((n, 3))
         one = np.ones((n, 1))
         m1 = np.hstack([draws[:, :2] * size1, one])
-        on_line, meets = _along(m1 @ F.T, size2, draws[:, 2])
+        on_line, meets = points_inside(m1 @ F.T, size2, draws[:, 2])
         m1, m2 = m1[meets], np.hstack([on_line, one])[meets]
         lines2, lines1 = m1 @ G.T, m2 @ G
         algebraic = np.abs((m2 * lines2).sum(axis=1))
@@ -110,7 +110,7 @@ def _one_way(
     return total / found if found else np.inf
 
 
-def _along(lines: Floats, size: Floats, shares: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def points_inside(lines: Floats, size: Floats, shares: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Points at the given shares of the lines' parts inside the image, and which lines meet it."""
     with np.errstate(divide="ignore", invalid="ignore"):
         lines = lines / np.hypot(lines[:, 0], lines[:, 1])[:, None]

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 from urllib.request import pathname2url
@@ -20,6 +21,7 @@ from urllib.request import pathname2url
 import numpy as np
 from numpy.typing import NDArray
 
+from cv_densityf._arguments import check
 from cv_densityf._coherence import coherence
 from cv_densityf._estimate import Estimate
 from cv_densityf._files import InputError
@@ -141,10 +143,8 @@ def verify_matches(
     takes focal lengths from the cameras whatever the configuration says. Planar and panoramic
     pairs are not told apart.
     """
-    if min_inliers < 8:
-        raise ValueError(f"min_inliers is {min_inliers}; it must be at least 8")
-    if not min_coherence <= 1:
-        raise ValueError(f"min_coherence is {min_coherence}; it must be a number up to 1")
+    check("min_inliers", min_inliers, Integral, lambda v: v >= 8, "an integer of 8 and more")
+    check("min_coherence", min_coherence, Real, lambda v: v <= 1, "a number up to 1")
     asked: dict[str, Any] = {
         "n_jobs": n_jobs, "progress": False, "method": method, "threshold": threshold, **options
     }  # fmt: skip

@@ -21,10 +21,6 @@ from cv_densityf._points import as_array, as_matches, as_umat, n_points
 
 _OPENCV_5 = int(cv2.__version__.split(".")[0]) >= 5
 
-#: Methods that go through the density pipeline: the rest of cv2's are not robust estimators, and an
-#: unknown number is LMEDS to cv2.
-_ROBUST = frozenset((cv2.FM_LMEDS, cv2.FM_RANSAC, *range(cv2.USAC_DEFAULT, cv2.USAC_MAGSAC + 1)))
-
 #: On more points graph cut runs out of memory or kills the process in OpenCV 5.0, as if it squared
 #: their number in 32 bits.
 _GRAPH_CUT_DIES_ABOVE = 46_340
@@ -371,7 +367,8 @@ def _is_ordinary(call: Call) -> bool:
     """Whether this is a robust method with numbers that mean to cv2 what they say."""
     params = call.params
     if params is None:
-        if call.method not in _ROBUST:
+        # The others are not robust estimators, and an unknown number is LMEDS to cv2.
+        if not (is_usac(call.method) or call.method in (cv2.FM_LMEDS, cv2.FM_RANSAC)):
             return False
         magsac = call.method == cv2.USAC_MAGSAC
     else:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib.util import find_spec
+from numbers import Integral, Real
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from cv_densityf._arguments import check
 
 _SIZE = (1280, 960)
 _FOCAL = 1000.0
@@ -94,7 +97,7 @@ def two_view_scene(
 ) -> Scene:
     """Draw matches of a scene of several objects before a wall, and wrong matches among them.
 
-    Four fifths of the true matches sit in tight groups on ten small tilted planes, the rest is
+    Four fifths of the true matches sit in tight groups on ten small curved patches, the rest is
     spread over the wall behind: texture is never spread evenly over an image. Wrong matches pair
     two places drawn uniformly.
 
@@ -117,7 +120,8 @@ def two_view_scene(
     Raises
     ------
     ValueError
-        If ``n`` is negative, ``inlier_ratio`` is not in [0, 1] or ``noise`` is negative.
+        If ``n`` is negative, ``inlier_ratio`` is not in [0, 1], or ``noise`` is negative or not
+        finite.
 
     Examples
     --------
@@ -130,12 +134,9 @@ def two_view_scene(
     >>> bool(estimate.mask[scene.inliers].all())
     True
     """
-    if n < 0:
-        raise ValueError(f"n must not be negative, it is {n}")
-    if not 0 <= inlier_ratio <= 1:
-        raise ValueError(f"inlier_ratio must lie in [0, 1], not {inlier_ratio}")
-    if not noise >= 0:
-        raise ValueError(f"noise must not be negative, it is {noise}")
+    check("n", n, Integral, lambda v: v >= 0, "an integer of 0 and more")
+    check("inlier_ratio", inlier_ratio, Real, lambda v: 0 <= v <= 1, "a number from 0 to 1")
+    check("noise", noise, Real, lambda v: 0 <= v < np.inf, "finite, of 0 and more, in pixels")
     rng = np.random.default_rng(random_state)
     size = np.array(_SIZE, dtype=np.float64)
     K = np.array([[_FOCAL, 0, size[0] / 2], [0, _FOCAL, size[1] / 2], [0, 0, 1]])

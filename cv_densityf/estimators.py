@@ -756,9 +756,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         self.threshold_: float = robust.threshold
         if rule == "lmeds":
             # The scale is that of the rows of fit; from then on the rule is RANSAC's.
-            with np.errstate(all="ignore"):
-                errors = np.square(_epipolar.residuals(self.F_, matches, rule)).astype(np.float32)
-            self.threshold_ = float(_epipolar._lmeds_threshold(errors[np.isfinite(errors)]))
+            self.threshold_ = _epipolar.lmeds_threshold(self.F_, matches)
             rule = "ransac"
         self._rule: Rule = rule
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
+from numbers import Integral, Real
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cv_densityf._arguments import check
 from cv_densityf._files import InputError
 
 #: Longer side, pixels, and number of features: enough for a precise F within about a second.
@@ -133,7 +135,7 @@ def detect(
     TypeError
         If ``image`` is not an array of real numbers.
     ValueError
-        If its shape is not an image's, or an option is not positive.
+        If its shape is not an image's, or an option is no positive integer.
 
     References
     ----------
@@ -142,8 +144,8 @@ def detect(
     CVPR 2012 (RootSIFT).
     """
     for name, value in (("max_size", max_size), ("max_features", max_features)):
-        if value is not None and value < 1:
-            raise ValueError(f"{name} must be a positive number or None, not {value}")
+        if value is not None:
+            check(name, value, Integral, lambda v: v >= 1, "an integer of 1 and more, or None")
     grey: NDArray[Any] = _grey(image)
     height, width = grey.shape
     scale = 1.0 if max_size is None else min(1.0, max_size / max(height, width))
@@ -190,8 +192,8 @@ def match_features(
     ValueError
         If ``ratio`` is not in (0, 1].
     """
-    if ratio is not None and not 0 < ratio <= 1:
-        raise ValueError(f"ratio must lie in (0, 1], not {ratio}")
+    if ratio is not None:
+        check("ratio", ratio, Real, lambda v: 0 < v <= 1, "a number in (0, 1], or None")
     nearest, ratios, is_mutual = _nearest(features1.descriptors, features2.descriptors)
     chosen = is_mutual if mutual else np.ones(len(nearest), dtype=bool)
     if ratio is not None:

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cv_densityf._arguments import check_mask
+from cv_densityf._zhang import points_inside
 from cv_densityf.matching import _grey
 
 if TYPE_CHECKING:
@@ -45,16 +47,18 @@ class _Style:
     label: str
     color: str
     marker: str
+    size: float
+    edge: float
     alpha: float
     order: int
 
 
 _STYLES = {
     # (kept, inlier)
-    (False, False): _Style("dropped", "#333333", ".", 0.6, 2),
-    (True, False): _Style("kept, not an inlier", "#D55E00", "x", 0.9, 3),
-    (True, True): _Style("kept, inlier", "#0072B2", "o", 0.9, 4),
-    (False, True): _Style("dropped, yet inlier", "#56B4E9", "^", 1.0, 5),
+    (False, False): _Style("dropped", "#333333", ".", 5.0, 0.0, 0.6, 2),
+    (True, False): _Style("kept, not an inlier", "#D55E00", "x", 5.0, 1.4, 0.9, 3),
+    (True, True): _Style("kept, inlier", "#0072B2", "o", 4.5, 0.0, 0.9, 4),
+    (False, True): _Style("dropped, yet inlier", "#56B4E9", "^", 5.5, 0.0, 1.0, 5),
 }
 
 
@@ -91,7 +95,7 @@ def plot_decision_graph(
     ImportError
         If matplotlib is not installed.
     ValueError
-        If ``kept`` or ``mask`` has another length than ``peaks``.
+        If ``kept`` or ``mask`` has another length than ``peaks``, or negative numbers or NaN.
 
     References
     ----------
@@ -111,14 +115,14 @@ def plot_decision_graph(
     rho, delta = np.asarray(peaks.rho), np.asarray(peaks.delta)
     product = (alpha or 0.0) * rho.max(initial=0) * delta.max(initial=0)
     on_or_above: NDArray[np.bool_] = rho * delta >= product
-    kept = on_or_above if kept is None else _mask(kept, len(rho), "kept")
-    mask = None if mask is None else _mask(mask, len(rho), "mask")
+    kept = on_or_above if kept is None else check_mask(kept, len(rho), "kept")
+    mask = None if mask is None else check_mask(mask, len(rho), "mask")
     ax = _axes(ax, (16, 7))
     handles = []
     for style, rows in _classes(kept, mask):
         (handle,) = ax.plot(
             rho[rows], delta[rows], ls="none", marker=style.marker, color=style.color,
-            ms=_marker_size(style), mew=_edge(style), alpha=style.alpha, zorder=style.order,
+            ms=style.size, mew=style.edge, alpha=style.alpha, zorder=style.order,
             label=f"{style.label} ({len(rows)})",
         )  # fmt: skip
         handles.append(handle)
@@ -188,8 +192,8 @@ def plot_matches(
     """
     X = _matches(X)
     finite = _finite(X)
-    kept = finite if kept is None else _mask(kept, len(X), "kept")
-    mask = None if mask is None else _mask(mask, len(X), "mask")[finite]
+    kept = finite if kept is None else check_mask(kept, len(X), "kept")
+    mask = None if mask is None else check_mask(mask, len(X), "mask")[finite]
     X, kept = X[finite], kept[finite]
     ax = _axes(ax, (16, 6))
     place1, place2 = _show(ax, image1, image2, X)
@@ -211,7 +215,7 @@ def plot_matches(
         ax.add_collection(lines, autolim=False)
         (handle,) = ax.plot(
             *np.vstack([shown1[rows], shown2[rows]]).T, ls="none", marker=style.marker,
-            ms=_marker_size(style), mew=_edge(style), color=style.color, alpha=style.alpha,
+            ms=style.size, mew=style.edge, color=style.color, alpha=style.alpha,
             zorder=style.order + 10, label=f"{style.label} ({len(rows)})",
         )  # fmt: skip
         handles.append(handle)
@@ -270,7 +274,7 @@ def plot_epipolar_lines(
     if F.shape != (3, 3):
         raise ValueError(f"F must have the shape (3, 3), not {F.shape}")
     finite = _finite(X)
-    mask = finite if mask is None else _mask(mask, len(X), "mask")
+    mask = finite if mask is None else check_mask(mask, len(X), "mask")
     ax = _axes(ax, (16, 6))
     places = _show(ax, image1, image2, X[finite])
     for number, row in enumerate(_far_apart(X, np.flatnonzero(mask & finite), n_lines)):
@@ -399,15 +403,6 @@ def _finite(X: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(X).all(axis=1))
 
 
-def _mask(values: ArrayLike, n: int, name: str) -> NDArray[np.bool_]:
-    mask = np.asarray(values).astype(bool)
-    if mask.shape == (n, 1):  # cv2's
-        mask = mask[:, 0]
-    if mask.shape != (n,):
-        raise ValueError(f"{name} must have the shape ({n},), not {mask.shape}")
-    return mask
-
-
 def _classes(
     kept: NDArray[np.bool_], mask: NDArray[np.bool_] | None
 ) -> Iterator[tuple[_Style, NDArray[np.intp]]]:
@@ -485,14 +480,6 @@ def _legend_above(ax: Axes, handles: list[Any]) -> None:
         )  # fmt: skip
 
 
-def _marker_size(style: _Style) -> float:
-    return {".": 5.0, "x": 5.0, "o": 4.5, "^": 5.5}[style.marker]
-
-
-def _edge(style: _Style) -> float:
-    return 1.4 if style.marker == "x" else 0.0
-
-
 def _far_apart(X: NDArray[np.float64], rows: NDArray[np.intp], n: int) -> list[int]:
     """Choose rows of ``X`` that are far from each other in the first image, greedily."""
     if len(rows) == 0 or n < 1:
@@ -508,22 +495,7 @@ def _far_apart(X: NDArray[np.float64], rows: NDArray[np.intp], n: int) -> list[i
 
 def _clipped(line: NDArray[np.float64], extent: NDArray[np.float64]) -> NDArray[np.float64] | None:
     """Cut the line a x + b y + c = 0 at a rectangle: its ends (2, 2), None where it misses."""
-    a, b, c = line
-    (left, top), (right, bottom) = extent
-    ends = []
-    if abs(b) > 0:
-        ends += [(x, -(a * x + c) / b) for x in (left, right)]
-    if abs(a) > 0:
-        ends += [(-(b * y + c) / a, y) for y in (top, bottom)]
-    slack = 1e-9 * float(np.abs(extent).max())
-    inside = [
-        (x, y)
-        for x, y in ends
-        if left - slack <= x <= right + slack and top - slack <= y <= bottom + slack
-    ]
-    if len(inside) < 2:
-        return None
-    # A line through a corner crosses two sides there: the two crossings farthest apart are meant.
-    points = np.array(inside)
-    along = points @ np.array([-b, a])
-    return points[[int(along.argmin()), int(along.argmax())]]
+    corner, size = extent[0], extent[1] - extent[0]
+    moved = np.array([*line[:2], line[2] + line[:2] @ corner])
+    ends, meets = points_inside(np.stack([moved, moved]), size, np.array([0.0, 1.0]))
+    return corner + ends if meets.all() else None

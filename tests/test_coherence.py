@@ -76,6 +76,9 @@ def test_rows_that_are_not_finite_and_outliers_do_not_count():
     expected = coherence(points1[mask], points2[mask])
     assert coherence(points1, points2, mask) == expected
     assert coherence(points1, points2, mask[:, None].astype(np.uint8)) == expected
+    for unclear in (np.where(mask, 1, -1), np.where(mask, 1, np.nan)):
+        with pytest.raises(ValueError, match="pass `mask > 0`"):
+            coherence(points1, points2, unclear)
     points1[~mask] = np.nan
     assert coherence(points1, points2) == expected
     assert coherence(points1.astype(np.float32), points2, mask) == pytest.approx(expected, abs=0.02)

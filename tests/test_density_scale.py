@@ -100,7 +100,7 @@ def test_the_same_sample_every_time():
 
 @pytest.mark.parametrize("size", [1, 0, -5, 2.5, "all"])
 def test_a_sample_is_a_number_of_points(size):
-    with pytest.raises(ValueError, match="sample_size is a number of points, at least 2"):
+    with pytest.raises(ValueError, match="must be a number of points, at least 2"):
         density_peaks(np.eye(5), sample_size=size)
 
 

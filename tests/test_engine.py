@@ -18,7 +18,6 @@ from cv_densityf._engine import (
     draw,
     is_usac,
     method_flag,
-    method_name,
     original,
     without_graph_cut,
 )
@@ -52,7 +51,7 @@ def test_every_name_is_cv2s_constant(name):
     for spelling in (name, name.upper(), constant, constant.lower(), flag, np.int32(flag)):
         assert method_flag(spelling) == flag
     assert is_usac(flag) == name.startswith("usac")
-    assert method_name(Robust(flag, 1.0, 0.99, 100)) == name
+    assert Robust(flag, 1.0, 0.99, 100).name == name
 
 
 def test_each_method_has_its_rule():
@@ -76,7 +75,7 @@ def test_unknown_methods_are_refused_with_the_choice(unknown):
 def test_params_have_the_rule_of_usac_whatever_the_flag():
     robust = Robust(cv2.FM_RANSAC, 1.0, 0.99, 100, cv2.UsacParams())
     assert robust.rule == "usac"
-    assert method_name(robust) == "usac"
+    assert robust.name == "usac"
 
 
 @pytest.mark.usefixtures("one_thread")

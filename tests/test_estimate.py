@@ -502,6 +502,21 @@ def test_the_order_of_prosac_is_that_of_scores(n_nan):
     assert not np.array_equal(expected, contrast_support(finite)[0])
 
 
+def test_cv2s_own_prosac_gets_the_best_scores_first():
+    X = scene_of(3, 300, 0.3).X
+    X[7] = np.nan
+    scores = np.random.default_rng(0).permutation(300)
+    order = np.argsort(-scores)
+    order = order[order != 7]
+    F, mask = cv2.findFundamentalMat(X[order, :2], X[order, 2:], cv2.USAC_PROSAC, 1.0, 0.999, 5000)
+    found = estimate(X, method="usac_prosac", density="off", scores=scores)
+    np.testing.assert_array_equal(found.F, F)
+    np.testing.assert_array_equal(found.mask[order], mask.ravel() == 1)
+    assert not found.mask[7]
+    # No other method minds the order.
+    assert_same(*(estimate(X, density="off", scores=s) for s in (scores, None)))
+
+
 @pytest.mark.parametrize("n", [1, 99, 100, 101, 150, 199, 100_000])
 def test_a_part_has_each_match_once_and_in_order(n):
     rows = _some(n, 100, np.random.default_rng(1))
@@ -634,6 +649,10 @@ def test_wrong_options_are_named_with_what_to_do(options, message):
         (np.zeros((20, 4)), GOOD, r"points1 has shape \(20, 4\)"),
         (GOOD.ravel(), GOOD, r"points1 has shape \(40,\)"),
         (GOOD.astype(np.complex64), GOOD, "points1 is of type complex64; .* real numbers"),
+        (GOOD, GOOD.astype(str), "points2 is of type <U.*; .* real numbers"),
+        (GOOD.astype("datetime64[s]"), GOOD, "points1 is of type datetime64.*; .* real numbers"),
+        ([["a", {}]] * 20, GOOD, "points1 is of type object; .* real numbers"),
+        ([[1, 2], [3]], GOOD, "points1 has rows of different length"),
         (np.zeros((5, 4, 2)), GOOD, r"points1 has shape \(5, 4, 2\)"),
     ],
 )

@@ -572,6 +572,13 @@ def test_more_clusters_than_points():
         DensityPeaks(n_clusters=5).fit(np.eye(3))
 
 
+def test_only_density_peaks_has_a_decision_graph(scene):
+    with pytest.raises(TypeError, match="DensityPeaksFilter has no decision graph"):
+        DecisionGraphDisplay.from_estimator(DensityPeaksFilter().fit(scene.X))
+    with pytest.raises(NotFittedError):
+        DecisionGraphDisplay.from_estimator(DensityPeaks())
+
+
 def test_decision_graph_display(scene):
     from matplotlib.figure import Figure
 
