@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from importlib.util import find_spec
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,19 +19,16 @@ from benchmarks.data import Pair
 from benchmarks.lpm import locality_preserving_matches
 from benchmarks.metrics import usable
 from cv_densityf import _engine
+from cv_densityf._arguments import Density
 from cv_densityf._epipolar import Frame, polish
+from cv_densityf._estimate import MIN_FILTERED
 from cv_densityf.cv2_api import findFundamentalMat
 
 Floats = NDArray[np.float64]
 Matches = tuple[Floats, Floats | None]
-Density = Literal["contrast", "paper"]
 
-#: With fewer matches left a filter is ignored.
-MIN_FILTERED = 15
 #: Width of the polish's weights, in thresholds, and its steps: the best of a few tried.
 POLISH_SCALE, POLISH_STEPS = 0.7, 8
-#: cv2's graph cut dies on more points than about this (OpenCV 5.0).
-MAX_GRAPH_CUT = 30_000
 
 
 @dataclass(frozen=True)
@@ -49,12 +46,11 @@ Estimator = Callable[[Pair, Settings], Floats | None]
 
 @dataclass(frozen=True)
 class Method:
-    """A named estimator, the module it needs, and whether it looks at the scores."""
+    """A named estimator, and the module it needs."""
 
     name: str
     estimate: Estimator
     needs: str = "cv2"
-    uses_scores: bool = False
 
     @property
     def installed(self) -> bool:
@@ -74,7 +70,7 @@ def _split(X: Floats) -> tuple[Floats, Floats]:
 
 
 def _cv2(X: Floats, flag: int, s: Settings) -> Floats | None:
-    if flag == cv2.USAC_ACCURATE and len(X) > MAX_GRAPH_CUT:
+    if flag == cv2.USAC_ACCURATE and len(X) > _engine.GRAPH_CUT_MAX:
         return None
     F, _ = _engine.Robust(flag, s.threshold, s.confidence, s.max_iters).plain(*_split(X))
     return usable(F)
@@ -157,6 +153,41 @@ def _pymagsac(pair: Pair, s: Settings) -> Floats | None:
         conf=s.confidence,
         max_iters=s.max_iters,
     )
+    return usable(F)
+
+
+def _pygcransac(pair: Pair, s: Settings, progressive: bool) -> Floats | None:
+    import pygcransac
+
+    F, _ = pygcransac.findFundamentalMatrix(
+        np.ascontiguousarray(_in_score_order(pair)[0] if progressive else pair.X),
+        *(*pair.size1[::-1], *pair.size2[::-1]),
+        np.empty(0),
+        threshold=s.threshold,
+        conf=s.confidence,
+        max_iters=s.max_iters,
+        sampler=1 if progressive else 0,
+    )
+    return usable(F)
+
+
+def _pysuperansac(pair: Pair, s: Settings, progressive: bool) -> Floats | None:
+    import pysuperansac
+
+    # A call divides the threshold in its settings by the points' scale.
+    settings = pysuperansac.RANSACSettings()
+    settings.inlier_threshold = s.threshold
+    settings.confidence = s.confidence
+    settings.max_iterations = s.max_iters
+    settings.min_iterations = min(settings.min_iterations, s.max_iters)
+    if not progressive:
+        settings.sampler = pysuperansac.SamplerType.Uniform
+    X = np.ascontiguousarray(_in_score_order(pair)[0] if progressive else pair.X)
+    sizes = [float(side) for side in (*pair.size1, *pair.size2)]
+    try:
+        F = pysuperansac.estimateFundamentalMatrix(X, sizes, [], config=settings)[0]
+    except RuntimeError:
+        return None
     return usable(F)
 
 
@@ -250,24 +281,24 @@ def _all_methods() -> list[Method]:
     methods = []
     for name in CV2_METHODS:
         flag = getattr(cv2, name)
-        in_order = flag == cv2.USAC_PROSAC
-        methods.append(Method(f"cv2:{name}", _cv2_method(flag), uses_scores=in_order))
+        methods.append(Method(f"cv2:{name}", _cv2_method(flag)))
     methods += [
         Method(
-            "cv2:PROSAC+MAGSAC",
-            lambda pair, s: _cv2_prosac_magsac(_in_score_order(pair)[0], s),
-            uses_scores=True,
+            "cv2:PROSAC+MAGSAC", lambda pair, s: _cv2_prosac_magsac(_in_score_order(pair)[0], s)
         ),
         Method("poselib", lambda pair, s: _poselib(pair.X, s, False), "poselib"),
         Method(
             "poselib:PROSAC",
             lambda pair, s: _poselib(_in_score_order(pair)[0], s, True),
             "poselib",
-            uses_scores=True,
         ),
         Method("pycolmap", lambda pair, s: _pycolmap(pair.X, s), "pycolmap"),
         Method("pydegensac", lambda pair, s: _pydegensac(pair.X, s), "pydegensac"),
         Method("pymagsac", _pymagsac, "pymagsac"),
+        Method("pygcransac", lambda pair, s: _pygcransac(pair, s, False), "pygcransac"),
+        Method("pygcransac:PROSAC", lambda pair, s: _pygcransac(pair, s, True), "pygcransac"),
+        Method("pysuperansac", lambda pair, s: _pysuperansac(pair, s, False), "pysuperansac"),
+        Method("pysuperansac:PROSAC", lambda pair, s: _pysuperansac(pair, s, True), "pysuperansac"),
     ]
     gms = _filtered(_gms, _cv2_magsac)
     lpm = _filtered(_lpm, _cv2_magsac)
@@ -275,18 +306,17 @@ def _all_methods() -> list[Method]:
     methods += [
         Method("gms>USAC_MAGSAC", gms),
         Method("lpm>USAC_MAGSAC", lpm),
-        Method("lpm>PROSAC+MAGSAC", lpm_prosac, uses_scores=True),
+        Method("lpm>PROSAC+MAGSAC", lpm_prosac),
         # What the polish alone is worth, and the filters with it.
         Method("cv2:USAC_ACCURATE>polish", _polished(_cv2_method(cv2.USAC_ACCURATE))),
         Method("gms>USAC_MAGSAC>polish", _polished(gms)),
         Method("lpm>USAC_MAGSAC>polish", _polished(lpm)),
-        Method("lpm>PROSAC+MAGSAC>polish", _polished(lpm_prosac), uses_scores=True),
+        Method("lpm>PROSAC+MAGSAC>polish", _polished(lpm_prosac)),
     ]
     for name in CV2_METHODS:
         flag = getattr(cv2, name)
-        in_order = flag == cv2.USAC_PROSAC
-        methods.append(Method(f"ours:{name}", _ours(flag, False), uses_scores=in_order))
-        methods.append(Method(f"ours:{name}+scores", _ours(flag, True), uses_scores=True))
+        methods.append(Method(f"ours:{name}", _ours(flag, False)))
+        methods.append(Method(f"ours:{name}+scores", _ours(flag, True)))
     methods.append(Method("ours:FM_RANSAC,paper", _ours(cv2.FM_RANSAC, False, density="paper")))
     return methods
 
