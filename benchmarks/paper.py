@@ -34,7 +34,7 @@ from cv_densityf._arguments import DensityRule
 from cv_densityf._density import density_peaks
 from cv_densityf._engine import Robust
 from cv_densityf._estimate import run
-from cv_densityf._prefilter import paper_support
+from cv_densityf._paper import paper_support
 from cv_densityf._zhang import epipolar_distance as zhang_distance
 from cv_densityf.matching import match_images
 from cv_densityf.plotting import plot_decision_graph, plot_matches

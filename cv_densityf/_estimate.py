@@ -20,10 +20,10 @@ from cv_densityf._arguments import (
     check_matches,
     check_scores,
 )
-from cv_densityf._consensus import eight_point_ransac, search
+from cv_densityf._consensus import search
 from cv_densityf._engine import Robust, method_flag
 from cv_densityf._epipolar import FAR, inlier_mask, middle
-from cv_densityf._prefilter import best_scored, contrast_support, paper_support
+from cv_densityf._prefilter import best_scored, contrast_support
 from cv_densityf._stopwatch import Stopwatch
 
 #: One line per estimate at level DEBUG.
@@ -181,6 +181,9 @@ def _estimate(
     with np.errstate(all="ignore"):
         try:
             if density == "paper":
+                # It needs scipy, whose import takes as long as cv2's.
+                from cv_densityf._paper import eight_point_ransac, paper_support
+
                 r, support = paper_support(Z, rule.alpha, rule.dc_percent)
                 watch.lap("density")
                 found = eight_point_ransac(Z[support], **asked)

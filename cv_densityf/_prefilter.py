@@ -184,18 +184,3 @@ def contrast_support(X: Floats, scores: Floats | None = None, rows: Ints | None 
     reliability = np.full(n, np.nan)
     reliability[rows] = ranked
     return Support(reliability, reliability >= 0.5, together)
-
-
-def paper_support(X: Floats, alpha: float, dc_percent: float) -> tuple[NDArray[np.float64], Bools]:
-    """Reliability gamma / (rho_max * delta_max), and the rows that reach ``alpha``.
-
-    The rule of Wu and Wan, section 2.6: a match whose rho * delta is lower than
-    alpha * rho_max * delta_max is an outlier.
-    """
-    # Only this rule needs scipy, whose import takes as long as cv2's.
-    from cv_densityf._density import density_peaks
-
-    peaks = density_peaks(X, dc_percent=dc_percent)
-    scale = float(peaks.rho.max() * peaks.delta.max())
-    reliability = peaks.gamma / scale if scale > 0 else np.ones(len(X))
-    return reliability, reliability >= alpha

@@ -34,7 +34,8 @@ from cv_densityf._density import checked_points, density_peaks
 from cv_densityf._display import DecisionGraphDisplay
 from cv_densityf._engine import METHODS, Robust, method_flag
 from cv_densityf._estimate import MIN_FILTERED, run
-from cv_densityf._prefilter import contrast_support, paper_support, ranks, with_scores
+from cv_densityf._paper import paper_support
+from cv_densityf._prefilter import contrast_support, ranks, with_scores
 
 if TYPE_CHECKING:
     from cv_densityf._epipolar import Rule

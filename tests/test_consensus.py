@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import norm
 
 from cv_densityf import _consensus, _engine, _stopwatch
 from cv_densityf._consensus import (
@@ -14,16 +13,12 @@ from cv_densityf._consensus import (
     _doubt,
     _noise,
     _Pool,
-    _samples_needed,
-    eight_point_ransac,
     search,
 )
 from cv_densityf._epipolar import (
     Frame,
     eight_point,
     essential_ratio,
-    inlier_mask,
-    point_line_squared,
     polish,
     sampson_distance,
     shift,
@@ -1096,128 +1091,6 @@ def test_noise_is_of_residuals_within_three_thresholds():
 
 def test_noise_of_exact_matches_is_nothing():
     assert _noise(np.zeros(50), 1.0) == 0.0
-
-
-# Wu and Wan's RANSAC
-
-
-@pytest.mark.parametrize("ratio", [0.1, 0.5, 0.9, 0.99])
-@pytest.mark.parametrize("confidence", [0.5, 0.99, 0.9999])
-def test_number_of_samples_follows_the_papers_equation(ratio, confidence):
-    k = _samples_needed(ratio, confidence)
-    if k > 1:
-        assert (1 - ratio**8) ** k == pytest.approx(1 - confidence, rel=1e-6)
-    else:
-        assert ratio**8 >= confidence * (1 - 1e-9)
-
-
-def test_one_sample_is_enough_if_all_matches_agree_and_very_many_if_few_do():
-    assert _samples_needed(1.0, 0.99) == 1.0
-    assert _samples_needed(1e-3, 0.99) > 1e20
-
-
-def recount(found, X, threshold):
-    return int(np.count_nonzero(point_line_squared(found.F, X) <= threshold**2))
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_papers_ransac_ends_by_its_equation(seed):
-    X = scene_of(seed, n=300, inlier_ratio=0.55, noise=0.0).X
-    found = eight_point_ransac(X, threshold=0.5, confidence=0.99, max_iters=100_000, seed=seed)
-    inliers = recount(found, X, 0.5)
-    assert found.votes == (inliers,)
-    assert found.reason.startswith(f"{inliers} of the 300 matches ")
-    assert inliers >= 160
-    # The clean sample came before the number that it asks for had been drawn.
-    assert found.n_draws == np.ceil(_samples_needed(inliers / 300, 0.99))
-
-
-def test_papers_ransac_ends_at_the_callers_bound():
-    X = scene_of(0, inlier_ratio=0.2).X
-    for bound in (1, 64, 65, 100):
-        found = eight_point_ransac(X, threshold=1.0, confidence=0.999, max_iters=bound, seed=0)
-        assert found is None or found.n_draws == bound
-
-
-def test_papers_ransac_needs_one_sample_of_exact_matches():
-    found = eight_point_ransac(
-        true_matches(0), threshold=1.0, confidence=0.99, max_iters=1000, seed=0
-    )
-    assert found.n_draws <= 3
-    assert sampson_distance(found.F, true_matches(0)).max() < 1.0
-
-
-def test_papers_ransac_returns_a_samples_f_not_a_fit():
-    """Eight matches are met much better than the other right ones."""
-    scene = scene_of(0, n=100, inlier_ratio=1.0, noise=1.0)
-    found = eight_point_ransac(scene.X, threshold=3.0, confidence=0.99, max_iters=100, seed=0)
-    refined = find(scene.X)
-    truth = true_matches(0)
-    assert sampson_distance(found.F, truth).mean() > sampson_distance(refined.F, truth).mean()
-
-
-def test_papers_ransac_is_seeded():
-    X = scene_of(0, inlier_ratio=0.5).X
-    F = [
-        eight_point_ransac(X, threshold=1.0, confidence=0.99, max_iters=70, seed=seed).F
-        for seed in (0, 0, 1)
-    ]
-    np.testing.assert_array_equal(F[0], F[1])
-    assert not np.array_equal(F[0], F[2])
-
-
-def test_papers_ransac_takes_eight_exact_matches_and_no_fewer_that_agree():
-    X = true_matches(0)[:8]
-    asked = {"threshold": 1.0, "confidence": 0.99, "max_iters": 200, "seed": 0}
-    found = eight_point_ransac(X, **asked)
-    assert found.votes == (8.0,)
-    assert sampson_distance(found.F, X).max() < 1.0
-    chance = np.random.default_rng(0).uniform(0, 1000, (20, 4))
-    assert eight_point_ransac(chance, **{**asked, "threshold": 1e-6}) is None
-
-
-@pytest.mark.parametrize("n_inliers", [7, 8, 30])
-def test_papers_ransac_takes_a_match_at_the_threshold_and_eight_of_them(n_inliers, monkeypatch):
-    """As the mask of ``FM_RANSAC`` does; the lines here are the rows of the image."""
-    F = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    monkeypatch.setattr(_consensus, "eight_point", lambda samples: np.tile(F, (len(samples), 1, 1)))
-    X = np.arange(120.0).reshape(30, 4)
-    X[:, 3] = X[:, 1] + np.where(np.arange(30) < n_inliers, 2.0, 2.001)
-    found = eight_point_ransac(X, threshold=2.0, confidence=0.99, max_iters=100, seed=0)
-    if n_inliers < 8:
-        assert found is None
-    else:
-        assert found.votes == (inlier_mask(F, X, "ransac", 2.0).sum(),) == (n_inliers,)
-        assert found.n_draws == (1 if n_inliers == 30 else 100)
-
-
-@pytest.mark.parametrize("n", [10, 70])
-def test_papers_ransac_draws_evenly_and_without_repetition(n, monkeypatch):
-    seen = []
-
-    def recorded(samples):
-        seen.append(samples)
-        return np.tile(np.eye(3), (len(samples), 1, 1))
-
-    monkeypatch.setattr(_consensus, "eight_point", recorded)
-    X = np.arange(4.0 * n).reshape(n, 4)
-    eight_point_ransac(X, threshold=1e-9, confidence=0.99, max_iters=500, seed=0)
-    rows = np.concatenate(seen)[:500, :, 0] / 4
-    assert rows.shape == (500, 8)
-    assert all(len(set(row)) == 8 for row in rows)
-    counts = np.bincount(rows.ravel().astype(int), minlength=n)
-    spread = norm.ppf(1 - 1e-6) * np.sqrt(500 * 8 / n * (1 - 8 / n))
-    np.testing.assert_allclose(counts, 500 * 8 / n, atol=spread)
-
-
-@pytest.mark.parametrize("n", [0, 7])
-def test_papers_ransac_needs_eight_matches(n):
-    assert (
-        eight_point_ransac(
-            true_matches(0)[:n], threshold=1.0, confidence=0.99, max_iters=10, seed=0
-        )
-        is None
-    )
 
 
 @pytest.mark.parametrize("n", [12, 16, 30])

@@ -29,7 +29,8 @@ from cv_densityf import _engine, estimators
 from cv_densityf._density import density_peaks
 from cv_densityf._engine import METHODS
 from cv_densityf._estimate import estimate_fundamental
-from cv_densityf._prefilter import contrast_support, paper_support
+from cv_densityf._paper import paper_support
+from cv_densityf._prefilter import contrast_support
 from cv_densityf.datasets import two_view_scene
 from cv_densityf.estimators import (
     DecisionGraphDisplay,

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
-import reference_density
 from scipy.stats import rankdata
 
 from cv_densityf import _prefilter
@@ -15,7 +12,6 @@ from cv_densityf._prefilter import (
     beyond_chance,
     contrast_support,
     density_contrast,
-    paper_support,
     ranks,
 )
 from cv_densityf.datasets import two_view_scene
@@ -316,39 +312,3 @@ def test_good_scores_help_and_bad_ones_do_not_overrule_the_contrast(seed):
     assert auc(contrast_support(scene.X, good)[0], scene.inliers) > alone
     assert auc(contrast_support(scene.X, rng.uniform(size=600))[0], scene.inliers) > 0.75
     assert auc(contrast_support(scene.X, -good)[0], scene.inliers) > 0.5
-
-
-@pytest.mark.parametrize("alpha", [0.0, 0.011, 0.3, 1.0])
-@pytest.mark.parametrize("percent", [2.0, 10.0])
-def test_papers_rule_is_the_formula(alpha, percent):
-    X = scene_of(1, 80, inlier_ratio=0.6).X
-    reliability, kept = paper_support(X, alpha, percent)
-    low, high = reference_density.cutoff_interval(X.tolist(), percent)
-    rho = np.array(reference_density.density(X.tolist(), (low + high) / 2, "cutoff"), float)
-    delta, _ = reference_density.delta_and_predecessor(X.tolist(), rho.tolist())
-    gamma = rho * np.array(delta)
-    np.testing.assert_allclose(reliability, gamma / (rho.max() * max(delta)), rtol=1e-9)
-    clear = np.abs(gamma - alpha * rho.max() * max(delta)) > 1e-9
-    np.testing.assert_array_equal(kept[clear], (gamma >= alpha * rho.max() * max(delta))[clear])
-
-
-def test_papers_rule_drops_more_with_larger_alpha_and_nothing_at_zero():
-    X = scene_of(1).X
-    supports = [paper_support(X, alpha, 2.0)[1] for alpha in (0.0, 0.005, 0.011, 0.1, 1.0)]
-    assert supports[0].all()
-    for larger, smaller in pairwise(supports):
-        assert not (smaller & ~larger).any()
-        assert smaller.sum() < larger.sum()
-
-
-def test_papers_rule_keeps_mostly_right_matches():
-    for seed in SEEDS:
-        scene = scene_of(seed, 600, inlier_ratio=0.3)
-        kept = paper_support(scene.X, 0.011, 2.0)[1]
-        assert scene.inliers[kept].mean() > 1.2 * 0.3
-
-
-def test_papers_rule_keeps_all_of_equal_matches():
-    reliability, kept = paper_support(np.ones((30, 4)), 0.011, 2.0)
-    assert kept.all()
-    assert np.isfinite(reliability).all()
