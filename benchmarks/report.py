@@ -37,6 +37,8 @@ PACKAGES = (
     "pycolmap",
     "pydegensac",
     "pymagsac",
+    "pygcransac",
+    "pysuperansac",
 )
 
 #: In a table, an error that is infinite.
