@@ -486,9 +486,9 @@ def numbers() -> Iterator[Case]:
                 rule="usac",
                 threshold=2.0,
             )
-    for name in ("sampler", "score", "loMethod"):
-        made = params(**{name: 99})
-        yield Case(f"numbers/UsacParams {name} 99", call(*halves(X), made), refused=True)
+    for name, value in (("sampler", 99), ("score", 99), ("loMethod", 99), ("loSampleSize", -1)):
+        made = params(**{name: value})
+        yield Case(f"numbers/UsacParams {name} {value}", call(*halves(X), made), refused=True)
     made = params(isParallel=True)
     yield Case("numbers/UsacParams isParallel", call(*halves(X), made), unstable=True)
 
@@ -596,6 +596,10 @@ def _masks(n: int) -> dict[str, Callable[[], Any]]:
         "(1, N)": lambda: filled((1, n)),
         "column of a table": lambda: filled((n, 2))[:, :1],
         "every second row": lambda: filled((2 * n, 1))[::2],
+        "transposed row": lambda: filled((1, n)).T,
+        "upside down, int32": lambda: filled((n, 1), np.int32)[::-1],
+        "by columns, float32": lambda: np.asfortranarray(filled((n, 2), np.float32)),
+        "without axes": lambda: filled(()),
         "too long": lambda: filled((n + 1, 1)),
         "too short": lambda: filled((n - 1, 1)),
         "empty": lambda: filled((0, 1)),
@@ -636,6 +640,7 @@ def masks() -> Iterator[Case]:
             _masks(n).items(), methods.items()
         ):
             refused = name in ("list", "str", "object array")
+            refused |= name in ("transposed row", "upside down, int32", "by columns, float32")
             refused |= name == "bool" and versions.REFUSES_BOOL_MASK
             refused |= name == "read-only" and versions.REFUSES_READ_ONLY_MASK
             sampled = n > 7 and method in (cv2.FM_LMEDS, cv2.FM_RANSAC)

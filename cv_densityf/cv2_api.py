@@ -25,6 +25,9 @@ _OPENCV_5 = int(cv2.__version__.split(".")[0]) >= 5
 #: their number in 32 bits.
 _GRAPH_CUT_DIES_ABOVE = 46_340
 
+#: Of an array.
+_CV_MAX_DIM = 32
+
 #: Below this threshold cv2's MAGSAC raises whatever the points are.
 _MAGSAC_MIN_THRESHOLD = 1e-3
 
@@ -261,17 +264,18 @@ def find(
     points1, points2 = as_array(call.points1), as_array(call.points2)
     n = None if points1 is None or points2 is None else _common_length(points1, points2, usac)
     trust = None if scores is None else check_scores(scores, n)
+    size = _longest_side(call.points1) if n is None else n
+    if _OPENCV_5 and size > _GRAPH_CUT_DIES_ABOVE and cuts_graph(call.method, call.params):
+        method, params = without_graph_cut(call.method, call.params)
+        third = (method, *call[3:6]) if params is None else (params,)
+        args, kwargs = (*call[:2], *third, call.mask), {}
     if points1 is None or points2 is None or n is None:
-        answer = _cv2s_answer(call, None, usac, args, kwargs)
+        answer = _cv2s_answer(call, size, usac, args, kwargs)
         return _passed_on(answer, None, density, start)
 
     slot = _mask_slot(call, n, usac)
     ordinary = n >= MIN_FILTERED and _is_ordinary(call)
     if density == "off" or not ordinary or slot is None:
-        if _OPENCV_5 and n > _GRAPH_CUT_DIES_ABOVE and cuts_graph(call.method, call.params):
-            method, params = without_graph_cut(call.method, call.params)
-            third = (method, *call[3:6]) if params is None else (params,)
-            args, kwargs = (*call[:2], *third, call.mask), {}
         try:
             answer = _cv2s_answer(call, n, usac, args, kwargs)
             return _passed_on(answer, n, density, start)
@@ -345,17 +349,33 @@ def _mask_slot(call: Call, n: int, usac: bool) -> _MaskSlot | None:
     if isinstance(mask, (int, float)) and call.params is None:
         # cv2 takes a number for an array of its own and drops it: the fate of maxIters=1000.0.
         return _MaskSlot(None, False)
-    if type(mask) is not np.ndarray or not mask.flags.writeable:
+    if type(mask) is not np.ndarray or not mask.flags.writeable or not _is_plain(mask):
         return None
     if mask.dtype in _IGNORED_MASKS or (mask.dtype == np.uint8 and mask.size != n):
         return _MaskSlot(None, False)
-    if mask.dtype != np.uint8 or not mask.flags.c_contiguous:
+    if mask.dtype != np.uint8:
         return None
     if mask.shape == (n, 1) or (mask.shape == (n,) and not (usac and _OPENCV_5)):
         return _MaskSlot(mask, False)
     if mask.shape in ((1, n), (n,)):
         return _MaskSlot(None if usac else mask, False)
     return None
+
+
+def _is_plain(array: NDArray[Any]) -> bool:
+    """Whether cv2 takes the array for an output: it minds strides that numpy does not."""
+    steps = (*array.strides, array.itemsize)
+    descending = all(
+        side < 2 or step >= inner
+        for side, step, inner in zip(array.shape, steps, steps[1:], strict=False)
+    )
+    return 0 < array.ndim < _CV_MAX_DIM and array.flags.c_contiguous and descending
+
+
+def _longest_side(points: Any) -> int:
+    """Guess the number of points of what only cv2 can read."""
+    array = points.get() if isinstance(points, cv2.UMat) else points
+    return max(getattr(array, "shape", ()), default=0)
 
 
 def _common_length(points1: NDArray[Any], points2: NDArray[Any], usac: bool) -> int | None:
@@ -377,6 +397,7 @@ def _is_ordinary(call: Call) -> bool:
             and params.score in range(4)
             and params.loMethod in range(5)
             and params.neighborsSearch in range(3)
+            and params.loSampleSize >= 0
         ):
             return False
         magsac = params.score == cv2.SCORE_METHOD_MAGSAC
@@ -389,7 +410,7 @@ def _is_ordinary(call: Call) -> bool:
 
 
 def _cv2s_answer(
-    call: Call, n: int | None, usac: bool, args: tuple[Any, ...], kwargs: dict[str, Any]
+    call: Call, n: int, usac: bool, args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> Any:
     """Make cv2's own call, and put zeros where no model leaves old or uninitialised memory."""
     F, mask = original(*args, **kwargs)
@@ -399,7 +420,7 @@ def _cv2s_answer(
     garbage = mask.get() if isinstance(mask, cv2.UMat) else mask
     # Fewer than 7 points leave the mask alone; exactly 7 are all inliers to cv2. An empty UMat
     # gets no array.
-    if garbage is not None and (garbage.size if n is None else n) > 7:
+    if garbage is not None and n > 7:
         if isinstance(mask, cv2.UMat):
             no_mask: Any = None
             cv2.copyTo(as_umat(np.zeros_like(garbage)), no_mask, mask)
@@ -410,7 +431,8 @@ def _cv2s_answer(
 
 def _is_solver_failure(error: cv2.error, call: Call, n: int, usac: bool) -> bool:
     """Whether cv2 failed on the points, and not for the way it was called."""
-    if error.code != cv2.Error.StsAssert:
+    # Its code may be that of an earlier error.
+    if f"({cv2.Error.StsAssert}:" not in str(error):
         return False
     if not usac:
         return n >= 7 and not math.isnan(call.confidence)
