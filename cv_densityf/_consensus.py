@@ -195,6 +195,7 @@ def search(
     rng = np.random.default_rng(abs(seed))
     n_draws = 0
     pool: _Pool | None = None
+    reliability, in_vain = np.empty(0), False
     for ranking, together in rankings:
         order = np.argsort(-ranking, kind="stable")[: np.count_nonzero(ranking >= 0.0)]
         reliable = order[: max(MIN_DRAW, len(order) // 2)]
@@ -590,7 +591,7 @@ def _noise(squared: Floats, threshold: float) -> float:
     few residuals, which a fit has made smaller.
     """
     r = np.sqrt(np.sort(squared))
-    cut, sigma = threshold, 0.4 * threshold
+    cut, sigma, below = threshold, 0.4 * threshold, 0
     for _ in range(4):
         below = int(r.searchsorted(cut))
         if below < 8:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from numbers import Integral, Real
 from typing import Any
 
@@ -178,15 +178,18 @@ def _estimate(
         "max_iters": robust.max_iters,
         "seed": seed,
     }
+    lowest = rule.alpha if density == "paper" else 0.5
     with np.errstate(all="ignore"):
         try:
             if density == "paper":
                 # It needs scipy, whose import takes as long as cv2's.
                 from cv_densityf._paper import eight_point_ransac, paper_support
 
-                r, support = paper_support(Z, rule.alpha, rule.dc_percent)
+                peaks, support = paper_support(Z, lowest, rule.dc_percent)
                 watch.lap("density")
                 found = eight_point_ransac(Z[support], **asked)
+                if found is not None:
+                    found = replace(found, reliability=peaks)
                 watch.lap("draws")
             else:
                 rankings = _rankings(Z, trust, seed, watch)
@@ -198,16 +201,12 @@ def _estimate(
                 found = search(
                     Z, rankings, watch=watch, about=about, scores=trust, others=others, **asked
                 )
-                if found is not None:
-                    r, support = found.reliability, found.reliability >= 0.5
         except np.linalg.LinAlgError:
             found = None
     if found is None:
         return plain("no draw on the dense part held")
     reliability = np.full(n, np.nan)
-    reliability[rows] = r
-    kept = np.zeros(n, dtype=bool)
-    kept[rows] = support
+    reliability[rows] = found.reliability
     mask = inlier_mask(found.F, X, robust.rule, robust.threshold)
     watch.lap("mask")
     if np.count_nonzero(mask) < MINIMAL:
@@ -219,7 +218,7 @@ def _estimate(
     return Estimate(
         F=found.F,
         mask=mask,
-        kept=kept,
+        kept=reliability >= lowest,
         reliability=reliability,
         n_draws=found.n_draws,
         agreed=found.agreed,

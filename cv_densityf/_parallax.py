@@ -61,12 +61,15 @@ def plane_and_parallax(
     half = norm.shape[1] // 2
     # The norm is 0 for a match of the two epipoles.
     norm = np.maximum(norm, 0.01 * np.partition(norm, half)[:, half])
-    plane: Floats = inliers.astype(np.float64)
-    for _ in range(_STEPS):
+
+    def fit(plane: Floats) -> tuple[Floats, Floats, Floats]:
         family = np.linalg.eigh(frame.gram(plane / norm))[1][0, :, :3]
         coordinates = family.T @ frame.products  # of so few matches that BLAS starts no threads
-        squared = (coordinates**2).sum(axis=0) / (frame.scale * width) ** 2
-        plane = inliers / (1.0 + squared / norm[0]) ** 2
+        return family, coordinates, (coordinates**2).sum(axis=0) / (frame.scale * width) ** 2
+
+    family, coordinates, squared = fit(inliers.astype(np.float64))
+    for _ in range(_STEPS - 1):
+        family, coordinates, squared = fit(inliers / (1.0 + squared / norm[0]) ** 2)
     # By the norm of one matrix, what is near its epipoles would be far off the plane; the mean over
     # the family is small nowhere.
     off_plane = squared > frame.errors(family.T.reshape(3, 3, 3))[1].mean(axis=0)
