@@ -239,7 +239,7 @@ def dense_pair(stride: int) -> Pair:
     size = (width, height)
     return Pair(
         name=f"stride {stride}", group="optical flow", X=rng.permutation(X), scores=None,
-        truth=truth, size1=size, size2=size, cameras=None, F_gt=None,
+        truth=truth, size1=size, size2=size,
     )  # fmt: skip
 
 
@@ -397,10 +397,7 @@ def _peak(name: str, path: str) -> float:
         if name in (EXACT, SAMPLED):
             density_peaks(X, sample_size=SAMPLE_SIZE if name == SAMPLED else None)
             return
-        pair = Pair(
-            name="", group="", X=X, scores=None, truth=X, size1=(0, 0), size2=(0, 0),
-            cameras=None, F_gt=None,
-        )  # fmt: skip
+        pair = Pair(name="", group="", X=X, scores=None, truth=X, size1=(0, 0), size2=(0, 0))
         METHODS[name].estimate(pair, Settings())
 
     call(make_scene("clusters", 200, 0.5, 0.5).X)

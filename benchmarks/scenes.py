@@ -33,7 +33,6 @@ class Kind:
 
     Attributes
     ----------
-    about : str
     wall : float
         Share of the true matches on the wall.
     truth_wall : float
@@ -48,7 +47,6 @@ class Kind:
         Whether the matches fix F. If not, any F that explains them is right.
     """
 
-    about: str
     wall: float = 0.2
     truth_wall: float = 0.2
     motion: str = "sideways"
@@ -57,14 +55,12 @@ class Kind:
 
 
 KINDS: dict[str, Kind] = {
-    "clusters": Kind("textured patches at many depths before a wall"),
-    "dominant_plane": Kind("90 % of the true matches on one wall", wall=0.9, truth_wall=0.5),
-    "repeated_texture": Kind(
-        "a quarter of the wrong matches one window too low, all alike", wall=0.3, coherent=0.25
-    ),
-    "forward": Kind("the camera moves along its axis", motion="forward"),
-    "one_plane": Kind("everything on one wall", wall=1.0, truth_wall=1.0, unique=False),
-    "rotation": Kind("the camera only turns", motion="none", unique=False),
+    "clusters": Kind(),
+    "dominant_plane": Kind(wall=0.9, truth_wall=0.5),
+    "repeated_texture": Kind(wall=0.3, coherent=0.25),
+    "forward": Kind(motion="forward"),
+    "one_plane": Kind(wall=1.0, truth_wall=1.0, unique=False),
+    "rotation": Kind(motion="none", unique=False),
 }
 
 #: Numbers of matches, inlier ratios and noise (px) of each kind, unless asked otherwise.

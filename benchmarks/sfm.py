@@ -14,19 +14,17 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks import rendered
-from benchmarks.rendered import SCENES, SIZE, View, intrinsics
+from benchmarks.rendered import SCENES, SIZE, View, intrinsics, photograph
 from benchmarks.report import _table, fill
 from cv_densityf.colmap import _image_ids, verify_matches
 
@@ -159,20 +157,10 @@ def match_views(views: Sequence[View], folder: Path, ratio: float) -> Path:
 
 
 def render_views(name: str) -> list[View]:
-    """Render a scene from all its `places`, two at a time, each with noise of its own."""
-    stands = iter(places(name))
-    views: list[View] = []
-    for seed, pair in enumerate(zip(stands, stands, strict=True)):
-        scene = replace(SCENES[name], places=pair)
-        with patch.dict(SCENES, {name: scene}):
-            views += rendered.render(name)
-        rng = np.random.default_rng(seed)
-        for i in (-2, -1):
-            # The renderer's own noise is the same in every pair.
-            noise = rng.normal(0, rendered.SENSOR_NOISE, views[i].image.shape)
-            noisy = np.clip(np.rint(views[i].image + noise), 0, 255).astype(np.uint8)
-            views[i] = replace(views[i], image=noisy)
-    return views
+    """Render a scene from all its `places`."""
+    scene = SCENES[name]
+    rng = np.random.default_rng(list(SCENES).index(name))
+    return photograph(scene.build, [(place, scene.target) for place in places(name)], rng)
 
 
 def places(name: str) -> list[tuple[float, float, float]]:
