@@ -65,6 +65,11 @@ def _in_score_order(pair: Pair) -> Matches:
     return pair.X[order], pair.scores[order]
 
 
+def _rows(pair: Pair, progressive: bool) -> Floats:
+    """Return the matches, best first for a sampler that takes them so."""
+    return _in_score_order(pair)[0] if progressive else pair.X
+
+
 def _split(X: Floats) -> tuple[Floats, Floats]:
     return np.ascontiguousarray(X[:, :2]), np.ascontiguousarray(X[:, 2:])
 
@@ -79,8 +84,7 @@ def _cv2(X: Floats, flag: int, s: Settings) -> Floats | None:
 def _cv2_method(flag: int) -> Estimator:
     def estimate(pair: Pair, s: Settings) -> Floats | None:
         # PROSAC's callers hand the best match first; all others get the shuffled rows.
-        X = _in_score_order(pair)[0] if flag == cv2.USAC_PROSAC else pair.X
-        return _cv2(X, flag, s)
+        return _cv2(_rows(pair, flag == cv2.USAC_PROSAC), flag, s)
 
     return estimate
 
@@ -105,7 +109,7 @@ def _cv2_prosac_magsac(X: Floats, s: Settings) -> Floats | None:
     return usable(robust.plain(*_split(X))[0])
 
 
-def _poselib(X: Floats, s: Settings, progressive: bool) -> Floats | None:
+def _poselib(pair: Pair, s: Settings, progressive: bool) -> Floats | None:
     import poselib
 
     options = {
@@ -115,7 +119,8 @@ def _poselib(X: Floats, s: Settings, progressive: bool) -> Floats | None:
         "seed": s.seed,
         "progressive_sampling": progressive,
     }
-    return usable(poselib.estimate_fundamental(*_split(X), options, {})[0])
+    points = _split(_rows(pair, progressive))
+    return usable(poselib.estimate_fundamental(*points, options, {})[0])
 
 
 def _pycolmap(X: Floats, s: Settings) -> Floats | None:
@@ -160,7 +165,7 @@ def _pygcransac(pair: Pair, s: Settings, progressive: bool) -> Floats | None:
     import pygcransac
 
     F, _ = pygcransac.findFundamentalMatrix(
-        np.ascontiguousarray(_in_score_order(pair)[0] if progressive else pair.X),
+        np.ascontiguousarray(_rows(pair, progressive)),
         *(*pair.size1[::-1], *pair.size2[::-1]),
         np.empty(0),
         threshold=s.threshold,
@@ -182,7 +187,7 @@ def _pysuperansac(pair: Pair, s: Settings, progressive: bool) -> Floats | None:
     settings.min_iterations = min(settings.min_iterations, s.max_iters)
     if not progressive:
         settings.sampler = pysuperansac.SamplerType.Uniform
-    X = np.ascontiguousarray(_in_score_order(pair)[0] if progressive else pair.X)
+    X = np.ascontiguousarray(_rows(pair, progressive))
     sizes = [float(side) for side in (*pair.size1, *pair.size2)]
     try:
         F = pysuperansac.estimateFundamentalMatrix(X, sizes, [], config=settings)[0]
@@ -223,7 +228,7 @@ def _filtered(
     """Filter, then estimate on what is left."""
 
     def estimate(pair: Pair, s: Settings) -> Floats | None:
-        X = _in_score_order(pair)[0] if in_order else pair.X
+        X = _rows(pair, in_order)
         kept = keep(pair, X)
         return solve(X[kept] if np.count_nonzero(kept) >= MIN_FILTERED else X, s)
 
@@ -283,15 +288,9 @@ def _all_methods() -> list[Method]:
         flag = getattr(cv2, name)
         methods.append(Method(f"cv2:{name}", _cv2_method(flag)))
     methods += [
-        Method(
-            "cv2:PROSAC+MAGSAC", lambda pair, s: _cv2_prosac_magsac(_in_score_order(pair)[0], s)
-        ),
-        Method("poselib", lambda pair, s: _poselib(pair.X, s, False), "poselib"),
-        Method(
-            "poselib:PROSAC",
-            lambda pair, s: _poselib(_in_score_order(pair)[0], s, True),
-            "poselib",
-        ),
+        Method("cv2:PROSAC+MAGSAC", lambda pair, s: _cv2_prosac_magsac(_rows(pair, True), s)),
+        Method("poselib", lambda pair, s: _poselib(pair, s, False), "poselib"),
+        Method("poselib:PROSAC", lambda pair, s: _poselib(pair, s, True), "poselib"),
         Method("pycolmap", lambda pair, s: _pycolmap(pair.X, s), "pycolmap"),
         Method("pydegensac", lambda pair, s: _pydegensac(pair.X, s), "pydegensac"),
         Method("pymagsac", _pymagsac, "pymagsac"),

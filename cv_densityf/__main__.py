@@ -414,11 +414,8 @@ def _run_match(options: argparse.Namespace) -> int:
         options.density == "off" or robust.direct or n_finite < MIN_FILTERED
     )
     compared = robust.for_size(len(X)) is robust
-    ordered = X
-    if robust.best_first and scores is not None:
-        ordered = X[np.argsort(-scores, kind="stable")]
     if compared and not same_call:
-        calls["plain cv2"] = lambda: robust.plain(ordered[:, :2], ordered[:, 2:])
+        calls["plain cv2"] = lambda: robust.plain(X[:, :2], X[:, 2:], scores)
     with _stage("estimating", timings):
         results, processor = _timed(calls)
     timings.update(processor)
@@ -427,7 +424,7 @@ def _run_match(options: argparse.Namespace) -> int:
     if compared and same_call:
         plain = _plain_report(X, robust, estimate.F, estimate.mask)
     elif compared:
-        plain = _plain_report(ordered, robust, *results["plain cv2"])
+        plain = _plain_report(X, robust, *results["plain cv2"])
     if options.plot is not None and estimate.F is not None and len(estimate.F) > 3:
         raise InputError("seven matches fit several matrices, and --plot draws the lines of one")
     report = {

@@ -142,9 +142,17 @@ class Robust:
         return replace(self, flag=flag, params=params)
 
     def plain(
-        self, points1: Any, points2: Any
+        self, points1: Any, points2: Any, scores: NDArray[np.float64] | None = None
     ) -> tuple[NDArray[np.float64] | None, NDArray[np.uint8] | None]:
-        """Make cv2's own call; (None, None) where its solver raises or finds nothing."""
+        """Make cv2's own call; (None, None) where its solver raises or finds nothing.
+
+        If the method wants the best first, and there are ``scores`` (n,), it gets them so; the mask
+        is in the order of the points all the same.
+        """
+        if scores is not None and self.best_first:
+            order = np.argsort(-scores, kind="stable")
+            F, mask = self.plain(points1[order], points2[order])
+            return F, None if mask is None else mask[np.argsort(order)]
         third: tuple[Any, ...] = (self.flag, self.threshold, self.confidence, self.max_iters)
         if self.params is not None:
             third = (self.params,)

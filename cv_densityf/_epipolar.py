@@ -77,16 +77,19 @@ def inlier_mask(F: Floats, X: Floats, rule: Rule, threshold: float) -> NDArray[n
         if rule == "usac":
             error = _sampson_squared(F.astype(np.float32), X.astype(np.float32))
             return np.asarray(error.astype(np.float64) < threshold * threshold)
-        if rule == "lmeds":
-            threshold = lmeds_threshold(F, X)
         error = point_line_squared(F, X).astype(np.float32)
+        if rule == "lmeds":
+            threshold = _lmeds_threshold(error)
         return np.asarray(error <= np.float32(threshold * threshold))
 
 
 def lmeds_threshold(F: Floats, X: Floats) -> float:
     """Largest residual of an inlier by the rule ``"lmeds"``, pixels."""
     with np.errstate(all="ignore"):
-        error = point_line_squared(F, X).astype(np.float32)
+        return _lmeds_threshold(point_line_squared(F, X).astype(np.float32))
+
+
+def _lmeds_threshold(error: Floats) -> float:
     error = error[np.isfinite(error)]
     n = len(error)
     if n <= 7:

@@ -23,7 +23,7 @@ from cv_densityf._arguments import (
 from cv_densityf._consensus import search
 from cv_densityf._engine import Robust, method_flag
 from cv_densityf._epipolar import FAR, inlier_mask, middle
-from cv_densityf._prefilter import best_scored, contrast_support
+from cv_densityf._prefilter import KEPT, best_scored, contrast_support
 from cv_densityf._stopwatch import Stopwatch
 
 #: One line per estimate at level DEBUG.
@@ -178,7 +178,7 @@ def _estimate(
         "max_iters": robust.max_iters,
         "seed": seed,
     }
-    lowest = rule.alpha if density == "paper" else 0.5
+    lowest = rule.alpha if density == "paper" else KEPT
     with np.errstate(all="ignore"):
         try:
             if density == "paper":
@@ -302,20 +302,17 @@ def _plain(
     if robust.rule == "ransac" and n_finite < MIN_FILTERED <= len(X):
         # It would be another method on so few; RANSAC itself knows rows that are not numbers.
         heard = np.ones_like(finite)
-    rows = np.flatnonzero(heard)
-    if scores is not None and robust.best_first:
-        rows = rows[np.argsort(-scores[rows], kind="stable")]
-    Z = X[rows]
+    Z = X if heard.all() else X[heard]
     asked, robust = robust, robust.for_size(len(Z))
     if robust is not asked:
         reason += ", without graph cut, which takes too long here"
-    F, found = robust.plain(Z[:, :2], Z[:, 2:])
+    F, found = robust.plain(Z[:, :2], Z[:, 2:], None if scores is None else scores[heard])
     if F is not None and len(Z) < len(X):
         # Through seven numbers cv2 stacks all matrices there are.
         F = F[:3]
     mask = np.zeros(len(X), dtype=bool)
     if found is not None:
-        mask[rows] = found.ravel() != 0
+        mask[heard] = found.ravel() != 0
     watch.lap("draws")
     name = robust.name
     if F is None:

@@ -29,6 +29,8 @@ _SIGNIFICANT = 6.0
 COHERENT = 0.35
 #: Of more matches than twice as many, it is looked at for every second, third, ... one.
 _COHERENCE_OF = 5_000
+#: Of this reliability and more, a match is kept.
+KEPT = 0.5
 #: Of the caller's scores the worst part, one match in so many, is no witness for others.
 _WORST = 5
 #: Rows compared at a time, so that the comparison table stays in the cache.
@@ -183,4 +185,4 @@ def contrast_support(X: Floats, scores: Floats | None = None, rows: Ints | None 
         ranked = with_scores(ranked, scores[rows])
     reliability = np.full(n, np.nan)
     reliability[rows] = ranked
-    return Support(reliability, reliability >= 0.5, together)
+    return Support(reliability, reliability >= KEPT, together)

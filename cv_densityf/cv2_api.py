@@ -25,7 +25,7 @@ _OPENCV_5 = int(cv2.__version__.split(".")[0]) >= 5
 #: their number in 32 bits.
 _GRAPH_CUT_DIES_ABOVE = 46_340
 
-#: Of an array.
+#: cv2 takes no array of so many axes.
 _CV_MAX_DIM = 32
 
 #: Below this threshold cv2's MAGSAC raises whatever the points are.
