@@ -85,6 +85,8 @@ _LOCAL_SAMPLES = (32, 8)
 _LOCAL_SAMPLES_IN_DOUBT = (96, 16)
 _LOCAL_STARTS_IN_DOUBT = 3
 _SAME_BASIN = 0.8
+#: Where a point of an image belongs to more than one match in so many, they share a vote.
+_MANY_CLAIM = 10
 #: Widths of the vote, in units of the working threshold.
 _VOTE_WIDTHS = np.array([0.3, 0.5, 0.8, 1.3])
 #: Votes saturate within a cell of this many to the longer side of each image.
@@ -345,7 +347,7 @@ class _Pool:
         #: The matches on the plane that most inliers suit, dominant or not.
         self._planar = np.zeros(len(X), dtype=bool)
         self._X = X
-        self._reliability = reliability
+        self._reliability = reliability = reliability / _claimants(X)
         self._reliable = reliable
         self._rng = rng
         self._frame = frame or Frame(X)
@@ -556,6 +558,22 @@ def _alike(inliers: Floats, one: Floats, overlap: float) -> Bools:
     """Which of some inlier sets (m, n) agree with another one (n,)."""
     common = inliers @ one
     return np.asarray(common >= overlap * (inliers.sum(axis=1) + one.sum() - common))
+
+
+def _claimants(X: Floats) -> Floats:
+    """Count the matches that share a point with each match, (n,): one of them is right at most.
+
+    An F whose epipole is that point suits them all. Told where a point has a good part of the
+    matches, such as tracks that were lost and left at a corner; else all ones.
+    """
+    total = np.ones(len(X))
+    for points in (X[:, :2], X[:, 2:]):
+        x = np.sort(points[:, 0])
+        many = len(x) // _MANY_CLAIM
+        if (x[many:] == x[: len(x) - many]).any():
+            _, place, count = np.unique(points, axis=0, return_inverse=True, return_counts=True)
+            total = np.maximum(total, count[place.ravel()])
+    return total
 
 
 def _credit(G: Floats) -> Floats:

@@ -46,6 +46,8 @@ _SEARCH_THRESHOLD = 0.01
 _LEEWAY = 2.0
 #: Matches of a minimal sample: fewer have no F, and an F that explains fewer is none.
 MINIMAL = 7
+#: If one image is so many times as large as the other, they are in different units.
+_OTHER_UNITS = 30.0
 #: A larger threshold, in units of the points' spread, is hardly meant.
 _COARSE = 0.1
 
@@ -167,8 +169,15 @@ def _estimate(
         rows = heard[_some(len(heard), MAX_SEARCHED, rng)]
     Z = X[rows] if len(rows) < n else X
     about = middle(Z)
-    if _on_a_line(Z, about):
+    on_a_line, sizes = _shape(Z, about)
+    if on_a_line:
         return plain("all points of an image are nearly on a line")
+    # What is to the eye one image beside another is to residuals one of them alone.
+    units = np.ones(2)
+    if max(sizes) > _OTHER_UNITS * min(sizes):
+        units = max(sizes) / sizes
+        Z = Z * units.repeat(2)
+        about = middle(Z)
     trust = None if scores is None else scores[rows]
     if trust is None and robust.best_first:
         trust = -rows.astype(np.float64)
@@ -197,7 +206,7 @@ def _estimate(
                 if len(heard) > len(rows):
                     searched = np.zeros(n, dtype=bool)
                     searched[rows] = True
-                    others = X[heard[~searched[heard]]]
+                    others = X[heard[~searched[heard]]] * units.repeat(2)
                 found = search(
                     Z, rankings, watch=watch, about=about, scores=trust, others=others, **asked
                 )
@@ -207,7 +216,8 @@ def _estimate(
         return plain("no draw on the dense part held")
     reliability = np.full(n, np.nan)
     reliability[rows] = found.reliability
-    mask = inlier_mask(found.F, X, robust.rule, robust.threshold)
+    F = found.F * np.outer([units[1], units[1], 1.0], [units[0], units[0], 1.0])
+    mask = inlier_mask(F, X, robust.rule, robust.threshold)
     watch.lap("mask")
     if np.count_nonzero(mask) < MINIMAL:
         return plain("too few matches fit at this threshold")
@@ -216,7 +226,7 @@ def _estimate(
         share = robust.threshold / about[1]
         reason += f"; the threshold is {share:.2g} of the points' spread: are they in pixels?"
     return Estimate(
-        F=found.F,
+        F=F,
         mask=mask,
         kept=reliability >= lowest,
         reliability=reliability,
@@ -269,8 +279,10 @@ def finite_in_cv2(X: NDArray[np.floating]) -> NDArray[np.bool_]:
         return np.asarray(np.isfinite(X.astype(np.float32)).all(axis=1))
 
 
-def _on_a_line(X: NDArray[np.float64], about: tuple[NDArray[np.floating], float]) -> bool:
-    """Whether an image's points lie on one line, or on one spot, as far as float32 can tell.
+def _shape(
+    X: NDArray[np.float64], about: tuple[NDArray[np.floating], float]
+) -> tuple[bool, NDArray[np.float64]]:
+    """Whether an image's points lie on one line or spot, as far as float32 can tell; their spreads.
 
     What lies far out from the centre and spread ``about`` is drawn in: the others would look like
     one spot from there.
@@ -280,12 +292,13 @@ def _on_a_line(X: NDArray[np.float64], about: tuple[NDArray[np.floating], float]
     largest = np.abs(columns).max(axis=1)
     centred = columns - columns.mean(axis=1, keepdims=True)
     covariance = centred @ centred.T / len(X)
+    sizes = np.sqrt(np.diagonal(covariance).reshape(2, 2).sum(axis=1))
     for image in (slice(0, 2), slice(2, 4)):
         (a, b), (_, d) = covariance[image, image]
         smallest = 0.5 * (a + d - np.hypot(a - d, 2.0 * b))
         if smallest <= 1e-12 * largest[image].max() ** 2:
-            return True
-    return False
+            return True, sizes
+    return False, sizes
 
 
 def _plain(

@@ -30,6 +30,9 @@ def as_array(points: Any) -> NDArray[Any] | None:
     # cv2 does not swap the bytes of the other byte order.
     if points.dtype.num not in _NUMBERS or not points.dtype.isnative:
         return None
+    # Fields of packed records, which cv2 refuses before OpenCV 5.
+    if any(step % points.itemsize for step in points.strides):
+        return None
     return np.asarray(points)
 
 
@@ -60,8 +63,7 @@ def as_columns(points: NDArray[Any], n: int, usac: bool) -> NDArray[np.float32]:
     A third column is a homogeneous weight that the classic methods divide by, once rounded to the
     array's own precision, and that USAC ignores.
     """
-    # (2, n) is what only USAC transposes, so with 2 or 3 points there is nothing to tell apart.
-    table = points.T if points.shape == (2, n) and n > 3 else points.reshape(n, -1)
+    table = points.T if points.shape == (2, n) else points.reshape(n, -1)
     if table.dtype in _WRAPPED:
         table = table.astype(np.int32)
     with np.errstate(all="ignore"):

@@ -270,14 +270,14 @@ def find(
         third = (method, *call[3:6]) if params is None else (params,)
         args, kwargs = (*call[:2], *third, call.mask), {}
     if points1 is None or points2 is None or n is None:
-        answer = _cv2s_answer(call, size, usac, args, kwargs)
+        answer = _cv2s_answer(call, size, args, kwargs)
         return _passed_on(answer, None, density, start)
 
     slot = _mask_slot(call, n, usac)
     ordinary = n >= MIN_FILTERED and _is_ordinary(call)
     if density == "off" or not ordinary or slot is None:
         try:
-            answer = _cv2s_answer(call, n, usac, args, kwargs)
+            answer = _cv2s_answer(call, n, args, kwargs)
             return _passed_on(answer, n, density, start)
         except cv2.error as error:
             if slot is None or not _is_solver_failure(error, call, n, usac):
@@ -409,13 +409,10 @@ def _is_ordinary(call: Call) -> bool:
     )
 
 
-def _cv2s_answer(
-    call: Call, n: int, usac: bool, args: tuple[Any, ...], kwargs: dict[str, Any]
-) -> Any:
+def _cv2s_answer(call: Call, n: int, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     """Make cv2's own call, and put zeros where no model leaves old or uninitialised memory."""
     F, mask = original(*args, **kwargs)
-    flagged = usac and call.params is None
-    if F is not None or mask is None or flagged or call.method == cv2.FM_8POINT:
+    if F is not None or mask is None or call.method == cv2.FM_8POINT:
         return F, mask
     garbage = mask.get() if isinstance(mask, cv2.UMat) else mask
     # Fewer than 7 points leave the mask alone; exactly 7 are all inliers to cv2. An empty UMat

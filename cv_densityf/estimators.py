@@ -7,8 +7,9 @@ Matches are rows x, y, x', y' in pixels. Every mask is boolean with one entry pe
 from __future__ import annotations
 
 import warnings
+from inspect import signature
 from numbers import Integral, Real
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,7 +31,7 @@ from sklearn.utils.validation import (
 
 from cv_densityf import _epipolar
 from cv_densityf._arguments import OFF, THRESHOLDS
-from cv_densityf._density import checked_points, density_peaks
+from cv_densityf._density import Kernel, checked_points, density_peaks
 from cv_densityf._display import DecisionGraphDisplay
 from cv_densityf._engine import METHODS, Robust, method_flag
 from cv_densityf._estimate import MIN_FILTERED, run
@@ -146,7 +147,7 @@ class DensityPeaks(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         "alpha": [Interval(Real, 0, 1, closed="both")],
         "dc": [Interval(Real, 0, None, closed="neither"), None],
         "dc_percent": [Interval(Real, 0, 100, closed="right")],
-        "kernel": [StrOptions({"cutoff", "gaussian"})],
+        "kernel": [StrOptions(set(get_args(Kernel)))],
         "sample_size": [Interval(Integral, 2, None, closed="left"), None],
         "halo": ["boolean"],
     }
@@ -158,7 +159,7 @@ class DensityPeaks(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         alpha: float = 0.1,
         dc: float | None = None,
         dc_percent: float = 2.0,
-        kernel: str = "cutoff",
+        kernel: Kernel = "cutoff",
         sample_size: int | None = None,
         halo: bool = False,
     ) -> None:
@@ -199,7 +200,7 @@ class DensityPeaks(ClusterMixin, BaseEstimator):  # type: ignore[misc]
             points,
             dc=self.dc,
             dc_percent=self.dc_percent,
-            kernel="gaussian" if self.kernel == "gaussian" else "cutoff",
+            kernel=self.kernel,
             sample_size=self.sample_size,
         )
         centers = (
@@ -595,7 +596,8 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
             candidates = np.ones(len(matches), dtype=bool)
             if self.prefilter is not None:
                 self.prefilter_ = clone(self.prefilter, safe=False)
-                answer = self.prefilter_.fit_predict(matches, **prefilter_params)
+                # A copy, since it may work in place.
+                answer = self.prefilter_.fit_predict(matches.copy(), **prefilter_params)
                 candidates = _enough(_as_mask(answer, len(matches)))
             F, candidates, reason = _plain_estimate(matches, candidates, robust)
         if F is None or not np.isfinite(F).all():
@@ -745,8 +747,9 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
                 f"fit got unexpected parameters {sorted(params)}; enable metadata routing "
                 "(sklearn.set_config(enable_metadata_routing=True)) to pass them to the prefilter"
             )
-        takes_weight = has_fit_parameter(self.prefilter, "sample_weight")
-        return {"sample_weight": weight} if takes_weight and weight is not None else {}
+        if weight is None or not _takes_weight(self.prefilter):
+            return {}
+        return {"sample_weight": weight}
 
     def _set_rule(self, robust: Robust, matches: NDArray[np.float64]) -> None:
         rule: Rule = robust.rule
@@ -782,6 +785,17 @@ def _enough(support: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.ones_like(support)
 
 
+def _takes_weight(prefilter: Any) -> bool:
+    """Whether ``fit_predict`` takes a ``sample_weight``, if only to hand it on to ``fit``."""
+    if not hasattr(prefilter, "fit_predict"):
+        return False
+    parameters = signature(prefilter.fit_predict).parameters
+    return "sample_weight" in parameters or (
+        any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters.values())
+        and has_fit_parameter(prefilter, "sample_weight")
+    )
+
+
 def _as_mask(answer: ArrayLike, n: int) -> NDArray[np.bool_]:
     """Read a prefilter's answer, a boolean mask or +-1."""
     mask = np.asarray(answer)
@@ -790,9 +804,15 @@ def _as_mask(answer: ArrayLike, n: int) -> NDArray[np.bool_]:
             return mask
         if np.isin(mask, (-1, 1)).all():
             return np.asarray(mask > 0)
+        others = np.setdiff1d(mask, (-1, 1))[:3].tolist()
+        raise ValueError(
+            "the prefilter's fit_predict must answer a boolean mask, or 1 for rows to keep and -1 "
+            f"for the others; it answered {', '.join(map(str, others))} as well: of clusters' "
+            "labels make a mask, such as labels >= 0"
+        )
     raise ValueError(
-        f"the prefilter's fit_predict must answer a boolean mask or +-1 with shape ({n},); it "
-        f"answered an array of shape {mask.shape} and dtype {mask.dtype}"
+        f"the prefilter's fit_predict must answer a mask of shape ({n},), one entry per row; it "
+        f"answered an array of shape {mask.shape}"
     )
 
 

@@ -7,6 +7,7 @@ processes that import cv2 afresh have to patch it themselves; threads share the 
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
@@ -60,6 +61,11 @@ class CallSite:
 
 
 _lock = threading.RLock()
+if hasattr(os, "register_at_fork"):
+    # A process forked while another thread holds it would wait for ever.
+    os.register_at_fork(
+        before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release
+    )
 #: The last one counts. `patch_cv2` has at most one in it, every open `patched` has its own, which
 #: is found again by identity.
 _patches: list[DensityRule] = []

@@ -312,6 +312,15 @@ def test_only_much_that_is_unexplained_is_drawn_from(wrong, made, monkeypatch):
     assert find(X, reliability).n_draws == len(draws) == made
     if made == 3:
         assert 0.8 * n < len(draws[2][0]) <= n
+        assert draws[2][2] < draws[0][2]
+
+
+def test_what_is_unreliable_may_stay_unexplained(monkeypatch):
+    right = true_matches(0, 400)
+    X = np.vstack([right, np.random.default_rng(0).uniform(0, [1280, 960] * 2, (270, 4))])
+    draws = spied_draws(monkeypatch, _engine.draw)
+    find(X, np.linspace(1.0, 0.0, 670))
+    assert len(draws) == 2
 
 
 def test_what_is_not_ranked_has_half_a_vote(monkeypatch):
@@ -1013,6 +1022,21 @@ def test_a_part_of_a_ballot_has_the_votes_of_its_matches():
     )
 
 
+def test_what_lies_far_out_leaves_the_others_their_cells():
+    scene = scene_of(0)
+    F = eight_point(scene.X[None, scene.inliers])
+    votes = []
+    for n_far in (0, 10):
+        X = np.vstack([scene.X, np.full((n_far, 4), 1e6)])
+        X -= scene.X.mean(axis=0)
+        pool = _Pool(X, np.ones(len(X)), np.arange(600), 1.0, np.random.default_rng(0))
+        centre = scene.X.mean(axis=0)
+        pool.add(shift(centre[2:]).T @ F @ shift(centre[:2]), [50])
+        votes.append(pool.votes[0])
+    # Their cells are larger, but by far not one.
+    assert votes[1] > 0.5 * votes[0]
+
+
 def test_vote_does_not_change_with_the_place_order_and_unit_of_the_matches():
     X = scene_of(0, n=100).X
     rng = np.random.default_rng(0)
@@ -1065,6 +1089,23 @@ def test_doubt_is_how_much_likelier_a_match_on_its_line_is_wrong_than_right(sigm
         expected = (1 - share) / 600 / (share / (np.sqrt(2 * np.pi) * sigma))
         assert np.exp(np.log(doubt[those]).mean()) == pytest.approx(expected, rel=0.6)
     assert np.median(doubt[reliability < 0.5]) > 20 * np.median(doubt[reliability > 0.5])
+
+
+def test_wrong_matches_beside_the_lines_hardly_pull_where_they_are_unreliable(monkeypatch):
+    """Those on one side of their lines pull F there, unless it is known that most are wrong."""
+    errors = []
+    for doubt in (_doubt, lambda *_: 0.1):
+        monkeypatch.setattr(_consensus, "_doubt", doubt)
+        for seed in range(4):
+            rng = np.random.default_rng(seed)
+            exact = true_matches(seed, 600)
+            X = exact + rng.normal(0, 0.3, exact.shape)
+            X[300:, 3] += rng.uniform(0, 6, 300)
+            reliability = np.where(np.arange(600) < 300, 0.9, 0.1)
+            pool = _Pool(X, reliability, np.arange(300), 1.0, rng)
+            pool.add(eight_point(exact[None]), [50])
+            errors.append(np.median(sampson_distance(pool.refined_best(), exact)))
+    assert np.mean(errors[:4]) < 0.7 * np.mean(errors[4:])
 
 
 def test_doubt_of_matches_of_one_reliability_is_the_same_in_any_order():

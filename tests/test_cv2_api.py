@@ -20,11 +20,12 @@ from compat.rules import USAC, rule_of
 from compat.scenes import DEGENERATE, degenerate
 from compat.versions import OPENCV
 from cv_densityf import cv2_api
+from cv_densityf._arguments import CONTRAST
 from cv_densityf._engine import original
 from cv_densityf._epipolar import inlier_mask
 from cv_densityf._estimate import estimate_fundamental
 from cv_densityf._overloads import resolve
-from cv_densityf.cv2_api import findFundamentalMat
+from cv_densityf.cv2_api import find, findFundamentalMat
 from cv_densityf.datasets import two_view_scene
 
 #: USAC_PARALLEL depends on the threads' timing.
@@ -380,6 +381,16 @@ def test_finds_the_scene(method):
 
 
 # -------------------------------------------------------------------------------------- mask=
+
+
+@pytest.mark.parametrize("method", [cv2.FM_RANSAC, cv2.FM_LMEDS, cv2.USAC_MAGSAC])
+@pytest.mark.parametrize("shape", [(150, 1), (1, 150), (150,)])
+def test_any_mask_that_cv2_fills_goes_with_the_search(method, shape):
+    given = np.full(shape, 9, np.uint8)
+    (_, mask), estimate = find((P1, P2, method), {"mask": given}, CONTRAST)
+    assert estimate is not None
+    assert estimate.engine == "density"
+    np.testing.assert_array_equal(mask.ravel(), estimate.mask)
 
 
 @pytest.mark.parametrize("id_", [id_ for id_ in CASES if id_.startswith("masks/")])

@@ -199,17 +199,30 @@ class Answers(BaseEstimator):
 
 
 @pytest.mark.parametrize(
-    "answer",
+    ("answer", "told"),
     [
-        np.repeat([0, 1], 200),  # two clusters, or a mask? Nobody knows
-        np.ones((400, 1), dtype=bool),
-        np.ones(399, dtype=bool),
-        np.arange(400),
+        # Two clusters, or a mask? Nobody knows.
+        (np.repeat([0, 1], 200), "it answered 0 as well"),
+        (np.arange(400), "it answered 0, 2, 3 as well"),
+        (np.ones((400, 1), dtype=bool), r"shape \(400,\).* shape \(400, 1\)"),
+        (np.ones(399, dtype=bool), r"shape \(400,\).* shape \(399,\)"),
     ],
 )
-def test_a_prefilter_that_answers_no_mask_is_refused(scene, answer):
-    with pytest.raises(ValueError, match=r"boolean mask or \+-1"):
+def test_a_prefilter_that_answers_no_mask_is_refused(scene, answer, told):
+    with pytest.raises(ValueError, match=told):
         FundamentalMatrixEstimator(Answers(answer)).fit(scene.X)
+
+
+def test_a_prefilter_may_work_in_place(scene):
+    class InPlace(Answers):
+        def fit_predict(self, X, y=None):
+            X -= X.mean(axis=0)
+            return np.ones(len(X), dtype=bool)
+
+    X = scene.X.copy()
+    estimator = FundamentalMatrixEstimator(InPlace()).fit(X)
+    np.testing.assert_array_equal(X, scene.X)
+    np.testing.assert_array_equal(estimator.F_, FundamentalMatrixEstimator(Answers()).fit(X).F_)
 
 
 def test_too_few_candidates_are_not_trusted(scene):
@@ -371,6 +384,22 @@ def test_sample_weight_reaches_the_prefilter(scene):
     estimator = FundamentalMatrixEstimator(Answers()).fit(scene.X, sample_weight=weight)
     np.testing.assert_array_equal(estimator.prefilter_.sample_weight_, weight)
     FundamentalMatrixEstimator(LocalOutlierFactor()).fit(scene.X, sample_weight=weight)
+
+
+def test_sample_weight_is_for_what_fit_predict_takes(scene):
+    weight = np.linspace(0, 1, len(scene.X))
+
+    class OfFitAlone(Answers):
+        def fit_predict(self, X, y=None):
+            return Answers.fit_predict(self, X)
+
+    class HandsOn(Answers):
+        def fit_predict(self, X, y=None, **options):
+            return Answers.fit_predict(self, X, **options)
+
+    for prefilter, given in ((OfFitAlone(), None), (HandsOn(), weight)):
+        estimator = FundamentalMatrixEstimator(prefilter).fit(scene.X, sample_weight=weight)
+        np.testing.assert_array_equal(estimator.prefilter_.sample_weight_, given)
 
 
 def test_metadata_are_routed(scene):

@@ -194,3 +194,34 @@ def test_a_power_of_two_changes_no_digit(factor):
     assert (here.mask == there.mask).mean() > 0.99
     np.testing.assert_array_equal(here.reliability, there.reliability)
     np.testing.assert_array_equal(here.kept, there.kept)
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("method", ["usac_magsac", *RULES])
+@pytest.mark.parametrize("side", SIDES[:2])
+@pytest.mark.parametrize("factor", [1 / 800, 40.0, 1e3])
+def test_the_images_may_be_in_different_units(plain, way, method, side, factor):
+    """Pixels beside normalised coordinates; the threshold is in the larger unit."""
+    T = scaling(factor)
+    first, second = (T, np.eye(3)) if side == "first" else (np.eye(3), T)
+    errors = []
+    for seed in SEEDS:
+        X = scene_of(seed)
+        X = np.hstack([mapped(X[:, :2], first), mapped(X[:, 2:], second)])
+        errors.append(error_of(WAYS[way](X, method, max(factor, 1.0)), seed, first, second))
+    assert np.median(errors) < 1.1 * np.median(plain[way, method]) + 0.02
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("method", ["usac_magsac", *RULES])
+@pytest.mark.parametrize("side", SIDES[:2])
+def test_tracks_that_end_in_one_point_change_little(plain, way, method, side):
+    """An F whose epipole is there suits all of them, twice as many as there are right ones."""
+    lost = slice(0, 2) if side == "first" else slice(2, 4)
+    errors = []
+    for seed in SEEDS:
+        scene = two_view_scene(500, inlier_ratio=0.3, noise=0.5, random_state=seed)
+        X = scene.X.copy()
+        X[~scene.inliers, lost] = -1.0
+        errors.append(error_of(WAYS[way](X, method, 1.0), seed))
+    assert np.median(errors) < 2.0 * np.median(plain[way, method]) + 0.02

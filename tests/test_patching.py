@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import _thread
+import os
 import subprocess
 import sys
 import textwrap
@@ -215,6 +216,40 @@ def run_python(code):
     return subprocess.run(
         [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=60
     )
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes cannot be forked here")
+def test_a_process_forked_while_another_thread_calls_goes_on():
+    done = run_python(
+        """
+        import os, sys, threading, time
+        import cv2, numpy as np
+        from cv_densityf import patching
+
+        patching.patch_cv2()
+        held = threading.Event()
+
+        def hold():
+            with patching._lock:
+                held.set()
+                time.sleep(0.2)
+
+        threading.Thread(target=hold).start()
+        held.wait()
+        child = os.fork()
+        if not child:
+            points = np.random.default_rng(0).uniform(0, 500, (8, 2))
+            cv2.findFundamentalMat(points, points[::-1].copy(), cv2.FM_8POINT)
+            os._exit(0)
+        for _ in range(200):
+            if os.waitpid(child, os.WNOHANG)[0]:
+                sys.exit(0)
+            time.sleep(0.05)
+        os.kill(child, 9)
+        sys.exit("it hangs")
+        """
+    )
+    assert done.returncode == 0, done.stderr
 
 
 def test_limits_names_imported_before_and_worker_processes():

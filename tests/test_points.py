@@ -75,6 +75,7 @@ LEFT_TO_CV2 = {
     "complex": POINTS.astype(complex),
     "object": POINTS.astype(object),
     "cv2.Mat": cv2.Mat(POINTS),
+    "packed records": np.zeros(N, dtype=[("octave", "u1"), ("point", "f4", 2)])["point"],
 }
 WRONG_SHAPE = {
     "(N,)": POINTS[:, 0],

@@ -74,11 +74,14 @@ def test_only_those_among_count_as_neighbours(neighbors):
         )
 
 
+@pytest.mark.parametrize("also_near", [False, True])
 @pytest.mark.parametrize("columns", [slice(0, 2), slice(2, 4)])
-def test_contrast_is_the_definition_where_two_matches_share_a_point(columns, neighbors):
+def test_contrast_is_the_definition_where_two_matches_share_a_point(columns, also_near, neighbors):
     """As a keypoint with two orientations may: neither is then sure to stand first in its list."""
     neighbors(7)
     X = scene_of(8, 80).X
+    if also_near:
+        X[40] = X[0] + 1.0
     X[40, columns] = X[0, columns]
     # For all others these two are equally near, in either order.
     two = [0, 40]
