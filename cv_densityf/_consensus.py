@@ -39,7 +39,8 @@ ROUNDS = (
     (BY_SCORE, 0.75, NEAR),
     (0.125, BY_SCORE, 1.0),
     (0.5, BY_SCORE, NEAR),
-    (0.25, 1.0),
+    (0.25, NEAR),
+    (1.0, NEAR),
 )
 #: After so many it may be hopeless.
 _ROUNDS_BY_CHANCE = 2
@@ -83,7 +84,7 @@ _LOCAL_SAMPLES = (32, 8)
 #: Where none do, the right F may be next to another hypothesis than the best: the same numbers
 #: from each of so many, whose inliers have less than this intersection over union.
 _LOCAL_SAMPLES_IN_DOUBT = (96, 16)
-_LOCAL_STARTS_IN_DOUBT = 3
+_LOCAL_STARTS_IN_DOUBT = 2
 _SAME_BASIN = 0.8
 #: Where a point of an image belongs to more than one match in so many, they share a vote.
 _MANY_CLAIM = 10

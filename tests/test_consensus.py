@@ -255,7 +255,7 @@ def test_of_the_samples_the_best_are_polished(monkeypatch, seed):
     ("sizes", "hopeless", "starts"),
     [
         ((60, 150), False, [(0, *_LOCAL_SAMPLES)]),
-        ((60, 60), False, [(i, *_LOCAL_SAMPLES_IN_DOUBT) for i in (0, 2, 3)]),
+        ((60, 60), False, [(i, *_LOCAL_SAMPLES_IN_DOUBT) for i in (0, 2)]),
         ((60, 60), True, [(0, *_LOCAL_SAMPLES)]),
     ],
 )
@@ -656,7 +656,7 @@ def test_the_unit_of_length_does_not_matter_to_what_is_made_of_the_draws(factor,
 def test_where_no_two_draws_agree_closely_the_best_is_optimised(monkeypatch):
     X = scene_of(0, inlier_ratio=0.9, noise=0.2).X
     assert find(X).n_draws == len(find(X).votes) == 2
-    for closest, n_draws in ((0.98, 2), (0.93, 10)):
+    for closest, n_draws in ((0.98, 2), (0.93, 12)):
         # Of agreement up to this: by less than ends the search, and by less than ends the draws.
         monkeypatch.setattr(
             _Pool, "agrees", lambda pool, least=0.93, most=closest, **_: least < most
