@@ -166,7 +166,11 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _cut(text: str) -> float | str:
-    return text if text == "all" else float(text)
+    if text == "all":
+        return text
+    if not float(text) > 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a SIFT ratio nor 'all'")
+    return float(text)
 
 
 def _number(text: str) -> int:
@@ -212,6 +216,11 @@ def _synthetic(args: argparse.Namespace) -> int:
 
 def _compare(args: argparse.Namespace, runs: Sequence[Run]) -> int:
     methods, skipped = choose(args.methods)
+    if not any(pairs for _, _, pairs in runs):
+        raise ValueError(
+            "there is no pair to compare: --cut takes pairs with SIFT ratios only, 'all' any; "
+            "--repeats is 1 at least"
+        )
     if skipped:
         print(f"not installed, left out: {', '.join(skipped)}", file=sys.stderr)
     records = _run(args, runs, methods)

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from benchmarks.data import Pair, load_pairs
 from benchmarks.metrics import LOST
 from benchmarks.paper import CUTS, Views, real_pairs, rendered_pairs
-from benchmarks.report import _table
+from benchmarks.report import table
 from cv_densityf import coherence, estimate_fundamental
 from cv_densityf._prefilter import COHERENT
 from cv_densityf.matching import detect, match_features
@@ -93,7 +93,7 @@ def _section(candidates: Mapping[str, Candidates], threshold: float) -> str:
         "coherence of one scene: least, 5 %, median", "of two: median, 95 %, most",
         "inliers of one scene", "of two", "AUC of coherence, of inliers",
     )  # fmt: skip
-    return f"## Threshold {threshold:g} px\n\n{_table(header, body)}"
+    return f"## Threshold {threshold:g} px\n\n{table(header, body)}"
 
 
 def look(X: Floats, threshold: float, truth: Pair | None = None) -> Found | None:

@@ -26,7 +26,7 @@ from tqdm import tqdm
 from benchmarks.data import TRUTH_BAND, Pair, load_pairs, move_onto
 from benchmarks.metrics import LOST, epipolar_distance, sampson_distance, usable
 from benchmarks.rendered import SCENES, render_pair
-from benchmarks.report import _LOST, _finite, _table
+from benchmarks.report import INFINITE, finite, table
 from benchmarks.run import one_thread
 from benchmarks.scenes import make_scene
 from cv_densityf import datasets
@@ -269,8 +269,8 @@ def reproduce(data: str | None, out: Path, seeds: int, quick: bool) -> str:
             _pairs_table(views),
             _growth_table(trials),
             *(
-                table([t for t in trials if t.cut == cut], cut)
-                for table in (_headline, _table_1, _table_2, _table_3)
+                part([t for t in trials if t.cut == cut], cut)
+                for part in (_headline, _table_1, _table_2, _table_3)
                 for cut in CUTS
             ),
             _limits_table(limits),
@@ -278,7 +278,7 @@ def reproduce(data: str | None, out: Path, seeds: int, quick: bool) -> str:
     )
     out.mkdir(parents=True, exist_ok=True)
     (out / "paper.md").write_text(report + "\n", encoding="utf-8")
-    records = [_finite(asdict(t)) for t in trials]
+    records = [finite(asdict(t)) for t in trials]
     (out / "paper.json").write_text(json.dumps(records) + "\n", encoding="utf-8")
     _plot_sweep(out / "paper-alpha.png", sweep)
     for source in ("real", "synthetic"):
@@ -473,7 +473,7 @@ def _spread(values: Iterable[float], digits: int = 3) -> str:
 
 
 def _short(value: float, digits: int) -> str:
-    return _LOST if np.isinf(value) else f"{value:.{digits}f}"
+    return INFINITE if np.isinf(value) else f"{value:.{digits}f}"
 
 
 def _pick(trials: Iterable[Trial], source: str, method: str, threshold: float) -> list[Trial]:
@@ -493,7 +493,7 @@ def _pairs_table(views: Sequence[Views]) -> str:
                 row[-1] += f", {np.mean(epipolar_distance(v.pair.F_gt, X) < RIGHT):.2f}"
         body.append(row)
     title = f"## Pairs\n\nA match within {RIGHT:g} px of F_0 counts as right.\n\n"
-    return title + _table(header, body)
+    return title + table(header, body)
 
 
 def _growth_table(trials: Sequence[Trial]) -> str:
@@ -511,7 +511,7 @@ def _growth_table(trials: Sequence[Trial]) -> str:
         body.append([cut, *(_spread(ratios, 1) for ratios in growth), share])
     header = ["", *(f"th {threshold:g}" for threshold in thresholds)]
     title = f"## RANSAC's time / that at {thresholds[0]:g} px, real pairs\n\n"
-    return title + _table([*header, f"share of inliers at {thresholds[0]:g} px"], body)
+    return title + table([*header, f"share of inliers at {thresholds[0]:g} px"], body)
 
 
 def _table_1(trials: Sequence[Trial], cut: str) -> str:
@@ -527,7 +527,7 @@ def _table_1(trials: Sequence[Trial], cut: str) -> str:
             name = f"{method}, alpha = {alpha:g}" if method in (PROPOSED, PROPOSED_CV2) else method
             drawn_from = _spread((float(t.drawn_from) for t in rows), 0)
             body.append([f"{threshold:g}", name, *_time_and_error(rows, ms, own), drawn_from])
-    return f"## Table 1: thresholds, real pairs, {cut}\n\n" + _table(header, body)
+    return f"## Table 1: thresholds, real pairs, {cut}\n\n" + table(header, body)
 
 
 def _table_2(trials: Sequence[Trial], cut: str) -> str:
@@ -545,7 +545,7 @@ def _table_2(trials: Sequence[Trial], cut: str) -> str:
             rows = _pick(trials, "real", method, threshold)
             body.append([method, *_time_and_error(rows, *TABLE_2.get(method, ("", "")))])
     title = f"## Table 2: other methods, real pairs, th {threshold:g} px, {cut}\n\n"
-    return title + _table(header, body)
+    return title + table(header, body)
 
 
 def _time_and_error(rows: Sequence[Trial], papers_ms: Any, papers_own: Any) -> list[str]:
@@ -576,7 +576,7 @@ def _table_3(trials: Sequence[Trial], cut: str) -> str:
             ]
         )
     title = f"## Table 3: synthetic pairs, th {threshold:g} px, alpha {alpha:g}, {cut}\n\n"
-    return title + _table(header, body)
+    return title + table(header, body)
 
 
 def _headline(trials: Sequence[Trial], cut: str) -> str:
@@ -601,7 +601,7 @@ def _headline(trials: Sequence[Trial], cut: str) -> str:
         paper = "" if papers is None else f"{papers:.2f}"
         body.append([f"{what}, {source} pairs, th {threshold:g}", paper, *ratios])
     title = f"## Headline: ratios to RANSAC on the same draw, below 1 is better, {cut}\n\n"
-    return title + _table(["ratio", "paper's", *HEADLINE], body)
+    return title + table(["ratio", "paper's", *HEADLINE], body)
 
 
 def _ratios(
@@ -636,7 +636,7 @@ def _limits_table(limits: Sequence[Trial]) -> str:
     header = ["varies", "scene"]
     for method in LIMITS_METHODS:
         header += [f"{method}: error", "lost", "ms"]
-    return title + _table(header, body)
+    return title + table(header, body)
 
 
 # Plots
@@ -725,8 +725,4 @@ def _plot_pair(folder: Path, views: Views) -> None:
             plot_decision_graph(peaks, alpha=alpha, kept=kept, mask=ransac_inliers, ax=ax)
         else:
             plot_matches(*views.images, X[kept], mask=own[kept], ax=ax)
-        # The package's own legend is for wider figures.
-        ax.legend(
-            loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False, markerscale=1.4
-        )
         _save(figure, folder / f"paper-{views.source}-{name}.png")

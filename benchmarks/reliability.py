@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from benchmarks.report import _table
+from benchmarks.report import table
 from benchmarks.scenes import make_scene
 from compat.cases import DOUBLES, INTEGERS, METHODS, NO_DOUBLES, NO_INTEGERS, Case, halves, params
 from compat.differences import differences
@@ -217,7 +217,7 @@ def beside_cv2(n: int, seed: int = 0) -> str:
         ("masks that can be worked out from F", count["masks"]),
         ("masks that are so, bit for bit", count["right masks"]),
     ]
-    text = _table([f"beside cv2 {cv2.__version__}", ""], [[k, f"{v:,}"] for k, v in rows])
+    text = table([f"beside cv2 {cv2.__version__}", ""], [[k, f"{v:,}"] for k, v in rows])
     return "\n".join([text, *(f"\n{line}" for line in tally.unexpected[:50])])
 
 
@@ -294,7 +294,7 @@ def under_load(seconds: float, n_threads: int = 8, n_processes: int = 4) -> str:
         ("calls", f"{sum(calls for calls, _ in done):,}"),
         ("answers that differ in a bit from the same call alone", f"{sum(w for _, w in done):,}"),
     ]
-    return _table(["under load", ""], rows)
+    return table(["under load", ""], rows)
 
 
 # ------------------------------------------------------------------------------ memory
@@ -318,7 +318,7 @@ def memory(n: int) -> str:
         if i in wanted:
             marks[i] = resident()
     header = ["calls", *(f"{i:,}" for i in marks)]
-    return _table(header, [["memory of the process, MB", *(f"{mb:.1f}" for mb in marks.values())]])
+    return table(header, [["memory of the process, MB", *(f"{mb:.1f}" for mb in marks.values())]])
 
 
 # ------------------------------------------------------------------------------ coordinates
@@ -340,12 +340,16 @@ MAPS: dict[str, tuple[Floats, Floats, float]] = {
     "second image a million pixels away": (_SAME, _similar(x=1e6, y=-1e6), 1.0),
     "both images a million pixels away": (_similar(x=-1e6), _similar(x=1e6, y=-1e6), 1.0),
     "second image turned and twice as large": (_SAME, _similar(2.0, 130.0, 50.0, -900.0), 1.0),
+    "second image in units of 800 px": (_SAME, _similar(1 / 800), 1.0),
 }
 #: Rows that are added.
 ADDED: dict[str, Callable[[Floats, np.random.Generator], Floats]] = {
     "every match four times more": lambda X, rng: np.tile(X, (4, 1)),
     "one wrong match 500 times": lambda X, rng: np.tile(rng.uniform(0, 900, (1, 4)), (500, 1)),
     "one wrong match 2,000 times": lambda X, rng: np.tile(rng.uniform(0, 900, (1, 4)), (2000, 1)),
+    "500 lost tracks that end in one point": lambda X, rng: np.hstack(
+        [rng.uniform(0, 900, (500, 2)), np.full((500, 2), -1.0)]
+    ),
     **{
         f"25 matches up to 1e{k} px away": lambda X, rng, k=k: rng.uniform(-(10**k), 10**k, (25, 4))
         for k in (4, 5, 6, 9)
@@ -389,7 +393,7 @@ def coordinates(scenes: int) -> str:
             error = float(np.median(errors))
             row.append("lost" if error > 20 else f"{error:.2f}")
         body.append(row)
-    text = _table(["median error, px", *ESTIMATORS], body)
+    text = table(["median error, px", *ESTIMATORS], body)
     return f"{text}\n\n{scenes} scenes; lost: above 20 px, an exception, or no F."
 
 

@@ -42,7 +42,7 @@ PACKAGES = (
 )
 
 #: In a table, an error that is infinite.
-_LOST = "lost"
+INFINITE = "lost"
 _TABLE = re.compile(r"^\|.*(?:\n\|.*)*", re.MULTILINE)
 
 Rows = list[Record]
@@ -74,10 +74,10 @@ def write_json(path: str | Path, records: Rows, settings: dict[str, Any]) -> Non
         "machine": {"platform": platform.platform(), "python": platform.python_version()},
         "packages": {name: v for name in PACKAGES if (v := _version(name))},
         "summary": [
-            {"section": section, "threshold": threshold, "method": method, **_finite(summary)}
+            {"section": section, "threshold": threshold, "method": method, **finite(summary)}
             for (section, threshold, method), summary in _summaries(records).items()
         ],
-        "records": [_finite(asdict(record)) for record in records],
+        "records": [finite(asdict(record)) for record in records],
     }
     Path(path).write_text(json.dumps(document, indent=1) + "\n")
 
@@ -89,7 +89,8 @@ def _version(name: str) -> str | None:
         return None
 
 
-def _finite(row: dict[str, Any]) -> dict[str, Any]:
+def finite(row: dict[str, Any]) -> dict[str, Any]:
+    """Put None, which JSON can hold, for numbers that are not finite."""
     return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in row.items()}
 
 
@@ -113,7 +114,7 @@ def _by_method(rows: Rows) -> dict[str, Rows]:
     return {m: [r for r in rows if r.method == m] for m in _values(rows, "method")}
 
 
-def _table(header: Sequence[str], body: Iterable[Sequence[str]]) -> str:
+def table(header: Sequence[str], body: Iterable[Sequence[str]]) -> str:
     """Figures to the right, the first column and words to the left."""
     body = list(body)
     columns = [[row[k] for row in body] for k in range(1, len(header))]
@@ -122,7 +123,7 @@ def _table(header: Sequence[str], body: Iterable[Sequence[str]]) -> str:
 
 
 def _is_words(cell: str) -> bool:
-    return cell[:1].isalpha() and cell != "inf" and not cell.startswith(_LOST)
+    return cell[:1].isalpha() and cell != "inf" and not cell.startswith(INFINITE)
 
 
 def fill(page: str | Path, report: str) -> None:
@@ -142,8 +143,8 @@ def fill(page: str | Path, report: str) -> None:
     """
     tables = {}
     for section in f"\n{report}".split("\n## ")[1:]:
-        if table := _TABLE.search(section):
-            tables[section.splitlines()[0]] = table[0]
+        if found := _TABLE.search(section):
+            tables[section.splitlines()[0]] = found[0]
     # From comment to comment: what comes before the first has none.
     text, *parts = re.split(r"(?m)^(?=<!-- table: )", Path(page).read_text("utf-8"))
     for part in parts:
@@ -161,7 +162,7 @@ def _share(value: float) -> str:
 
 
 def _pixels(value: float) -> str:
-    return _LOST if np.isinf(value) else f"{value:.2f}"
+    return INFINITE if np.isinf(value) else f"{value:.2f}"
 
 
 def _overall(rows: Rows) -> str:
@@ -179,12 +180,12 @@ def _overall(rows: Rows) -> str:
         f"time / {REFERENCE}": lambda s: _share(s["ms_total"] / reference),
     }
     n, seeds = len(_values(rows, "pair")), _values(rows, "seed")
-    table = _table(
+    methods = table(
         ["method", *columns],
         ([method, *(show(s) for show in columns.values())] for method, s in summaries.items()),
     )
     times = f", {len(seeds)} times each, with seeds {_listed(seeds)}" if len(seeds) > 1 else ""
-    return f"{n} pairs{times}.\n\n{table}"
+    return f"{n} pairs{times}.\n\n{methods}"
 
 
 def _listed(seeds: Sequence[int]) -> str:
@@ -202,8 +203,8 @@ def _per_group(rows: Rows) -> str:
             s = _summary([r for r in rows if r.method == method and r.group == group])
             cells[method, group] = f"{_share(s['mAA'])} / {_share(s['lost'])}"
     if len(groups) > len(methods):
-        return _table(["set", *methods], ([g, *(cells[m, g] for m in methods)] for g in groups))
-    return _table(["method", *groups], ([m, *(cells[m, g] for g in groups)] for m in methods))
+        return table(["set", *methods], ([g, *(cells[m, g] for m in methods)] for g in groups))
+    return table(["method", *groups], ([m, *(cells[m, g] for g in groups)] for m in methods))
 
 
 def _against_cv2(rows: Rows) -> list[str]:
@@ -231,7 +232,7 @@ def _against_cv2(rows: Rows) -> list[str]:
     if not body:
         return []
     header = ["method", "mAA", "> 5 px", "AUC5", "wins : losses", "time ratio"]
-    return ["cv2's own → ours:\n\n" + _table(header, body)]
+    return ["cv2's own → ours:\n\n" + table(header, body)]
 
 
 def _wins_and_losses(ours: Rows, theirs: Rows) -> tuple[int, int]:
@@ -250,7 +251,7 @@ def _paired(rows: Rows) -> list[str]:
     for peer in peers:
         counts = (_wins_and_losses(by_method[m], by_method[peer]) for m in ours)
         body.append([peer, *(f"{wins} : {losses}" for wins, losses in counts)])
-    return ["Calls won : lost (errors within 2 % tie):\n\n" + _table(["against", *ours], body)]
+    return ["Calls won : lost (errors within 2 % tie):\n\n" + table(["against", *ours], body)]
 
 
 def _worst(rows: Rows, count: int = 10) -> list[str]:
@@ -269,7 +270,7 @@ def _worst(rows: Rows, count: int = 10) -> list[str]:
         shown = (_pixels(errors[method][pair]) for method in (ours, best))
         body.append([pair, str(n[pair]), *shown, best])
     header = ["pair", "matches", "error px", "best px", "by"]
-    return [f"Worst pairs of {ours}:\n\n" + _table(header, body)]
+    return [f"Worst pairs of {ours}:\n\n" + table(header, body)]
 
 
 def _by_pair(rows: Rows) -> dict[str, float]:
@@ -288,7 +289,7 @@ def _spread(rows: Rows) -> str:
         maa = [_summary([r for r in own if r.threshold == t])["mAA"] for t in thresholds]
         body.append([method, *(f"{value:.3f}" for value in maa), f"{max(maa) - min(maa):.3f}"])
     header = ["mAA of", *(f"{t:g} px" for t in thresholds), "largest less smallest"]
-    return _table(header, body)
+    return table(header, body)
 
 
 def write_plots(folder: str | Path, records: Rows) -> list[Path]:

@@ -19,7 +19,7 @@ from scipy.spatial.distance import cdist
 
 from benchmarks.data import Pair
 from benchmarks.peers import METHODS, Method, Settings, choose
-from benchmarks.report import _table
+from benchmarks.report import table
 from benchmarks.run import one_thread, warm_up
 from benchmarks.scenes import make_scene
 from cv_densityf import _estimate
@@ -440,7 +440,7 @@ def _times(
                 cell = _two_digits(ms / series[reference].time(n))
             row.append(form.format(cell) if cell else "")
         body.append([*row, _cell(s.exponent, ".2f")])
-    return _table(header, body)
+    return table(header, body)
 
 
 def _two_digits(ratio: float) -> str:
@@ -454,7 +454,7 @@ def _errors(series: Mapping[str, Series], numbers: Sequence[int]) -> str:
         for name, s in series.items()
         if s.errors
     )
-    return _table(["median over the scenes", *(f"N = {n:,}" for n in numbers)], body)
+    return table(["median over the scenes", *(f"N = {n:,}" for n in numbers)], body)
 
 
 def _parts_table(parted: Mapping[float, Mapping[int, tuple[float, float]]]) -> str:
@@ -464,16 +464,16 @@ def _parts_table(parted: Mapping[float, Mapping[int, tuple[float, float]]]) -> s
         for ratio, row in parted.items():
             body.append([f"{name}, {ratio:.0%} inliers", *(f"{row[n][k]:.2f}" for n in numbers)])
     header = ["geometric mean over the scenes", *(f"N = {n:,}" for n in numbers)]
-    return _table(header, body)
+    return table(header, body)
 
 
 def _speedups(found: Mapping[str, float]) -> str:
     header = [f"{N_PAIRS} pairs of {PAIR_SIZE:,} matches", "by the clock"]
-    return _table(header, [[name, f"{ratio:.2f}"] for name, ratio in found.items()])
+    return table(header, [[name, f"{ratio:.2f}"] for name, ratio in found.items()])
 
 
 def _costs(costs: Mapping[str, float]) -> str:
-    return _table(["", "processor time"], [[name, _two_digits(x)] for name, x in costs.items()])
+    return table(["", "processor time"], [[name, _two_digits(x)] for name, x in costs.items()])
 
 
 def _memory(memory: Mapping[int, Mapping[str, float]]) -> str:
@@ -482,7 +482,7 @@ def _memory(memory: Mapping[int, Mapping[str, float]]) -> str:
         [name, *(_cell(peaks.get(name, np.nan), ".0f") for peaks in memory.values())]
         for name in names
     )
-    return _table(["", *(f"N = {n:,}" for n in memory)], body)
+    return table(["", *(f"N = {n:,}" for n in memory)], body)
 
 
 def draw(path: str, calls: Mapping[str, Series], clustering: Mapping[str, Series]) -> None:

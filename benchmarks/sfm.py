@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from benchmarks.rendered import SCENES, SIZE, View, intrinsics, photograph
-from benchmarks.report import _table, fill
-from cv_densityf.colmap import _image_ids, verify_matches
+from benchmarks.report import fill, table
+from cv_densityf.colmap import image_ids, verify_matches
 
 Floats = NDArray[np.float64]
 
@@ -98,7 +98,7 @@ def mix(names: Sequence[str], ratio: float, folder: Path, seed: int = 0) -> dict
             name_of = dict(connection.execute("SELECT image_id, name FROM images"))
             pairs = connection.execute("SELECT pair_id FROM two_view_geometries WHERE rows > 0")
             scenes = [
-                {int(name_of[i][:-4]) // N_VIEWS for i in _image_ids(pair_id)}
+                {int(name_of[i][:-4]) // N_VIEWS for i in image_ids(pair_id)}
                 for (pair_id,) in pairs
             ]
         right = sum(len(scene) == 1 for scene in scenes)
@@ -262,7 +262,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             body.append([str(cell) for cell in cells])
     n_pairs = N_VIEWS * (N_VIEWS - 1) // 2
     title = f"{N_VIEWS} views of {SIZE[0]} x {SIZE[1]}, {n_pairs} pairs"
-    text = f"## {title}\n\n{_table(header, body)}"
+    text = f"## {title}\n\n{table(header, body)}"
     if len(args.scenes) > 1:
         two = args.scenes[:2]
         text += f"\n\n## Views of {' and '.join(two)} together\n\n{_mixtures(two, args.seed)}"
@@ -287,7 +287,7 @@ def _mixtures(names: Sequence[str], seed: int) -> str:
         "matches", "verification", f"pairs of one scene, of {n_right}",
         f"pairs of two scenes, of {n_wrong}", "time / COLMAP's",
     )  # fmt: skip
-    return _table(header, body)
+    return table(header, body)
 
 
 if __name__ == "__main__":

@@ -66,7 +66,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Exit code: 0 found, 1 no fundamental matrix found, 2 wrong use.
     """
     options, unknown = _parser().parse_known_args(arguments)
-    if unknown:
+    if options.run == _run_match and not any(word.startswith("-") for word in unknown):
+        # Of images with options between them argparse takes the first only.
+        options.images += unknown
+    elif unknown:
         # By the command's own parser, whose help has the options.
         options.error(f"unknown: {' '.join(unknown)}")
     if options.run == run_script:
@@ -153,7 +156,8 @@ _THRESHOLD = _number(
     lambda v: THRESHOLDS[0] < v < THRESHOLDS[1],
     "a positive number between {:g} and {:,.0f}".format(*THRESHOLDS),
 )
-_POSITIVE_INT = _number(int, lambda v: 0 < v < 2**31, "a positive whole number")
+_POSITIVE_INT = _number(int, lambda v: 0 < v < 2**31, "a whole number from 1 to 2147483647")
+_JOBS = _number(int, lambda v: 0 < abs(v) < 2**31, "a whole number of pairs, or -1 for all cores")
 _SEED = _number(int, lambda v: 0 <= v < 2**31, "a whole number from 0 to 2147483647")
 _SHARE = _number(float, lambda v: 0 < v < 1, "a number between 0 and 1")
 _RATIO = _number(float, lambda v: 0 < v <= 1, "a number above 0 and up to 1")
@@ -296,7 +300,7 @@ def _add_verify(commands: argparse._SubParsersAction[Any]) -> None:
     verify.add_argument(
         "--min-inliers",
         metavar="N",
-        type=_number(int, lambda v: 8 <= v < 2**31, "a whole number from 8"),
+        type=_number(int, lambda v: 8 <= v < 2**31, "a whole number from 8 to 2147483647"),
         default=15,
         help="a pair with fewer is degenerate (%(default)s, as COLMAP)",
     )
@@ -308,7 +312,11 @@ def _add_verify(commands: argparse._SubParsersAction[Any]) -> None:
         help="so is a pair whose inliers keep fewer of their neighbours (%(default)s)",
     )
     verify.add_argument(
-        "--jobs", metavar="N", type=_POSITIVE_INT, default=-1, help="pairs at a time (all cores)"
+        "--jobs",
+        metavar="N",
+        type=_JOBS,
+        default=-1,
+        help="pairs at a time, -1 for one per core (%(default)s)",
     )
     verify.add_argument(
         "--resume", action="store_true", help="leave pairs alone that are verified already"
@@ -433,7 +441,7 @@ def _run_match(options: argparse.Namespace) -> int:
         "scores": scores is not None,
         **_report(X, robust, estimate, plain, timings),
     }
-    _say(json.dumps(report, allow_nan=False) if options.json else _for_people(report))
+    _say(json.dumps(report, allow_nan=False) if options.json else _for_people(report, robust))
     if report["F"] is None:
         reason = "cv2's numbers are not finite" if estimate else estimate.reason
         if n_finite < MINIMAL:
@@ -447,8 +455,7 @@ def _run_match(options: argparse.Namespace) -> int:
         _write(options.output, X, scores, estimate, report)
     if options.plot is not None:
         with _stage("drawing", timings):
-            by_paper = options.density == "paper" and estimate.engine == "density"
-            _draw(options.plot, images, X, estimate, alpha if by_paper else None)
+            _draw(options.plot, images, X, estimate, alpha if options.density == "paper" else None)
     written = [str(path) for path in (options.output, options.plot) if path is not None]
     if written and not options.json:
         _say(f"\nWritten: {', '.join(written)}")
@@ -534,17 +541,16 @@ def _median_residual(F: Floats | None, X: Floats, robust: Robust) -> float | Non
     return median if np.isfinite(median) else None
 
 
-def _for_people(report: dict[str, Any]) -> str:
+def _for_people(report: dict[str, Any], robust: Robust) -> str:
+    finds_its_own = robust.rule == "lmeds"
     times = report["timings_ms"]
     kept, ranked, n = (report[name] for name in ("n_kept", "n_ranked", "n_matches"))
     kept = kept if ranked == n else f"{kept} of {ranked}"
     ours = [kept, *_result(report), f"{times['estimating']:.1f}"]
     names = ["kept as dense", "inliers", "coherence", "median residual, px", "processor time, ms"]
-    lines = [
-        f"{n} matches{' with scores' if report['scores'] else ''}, {report['method']}, "
-        f"threshold {report['threshold']:g} px",
-        "",
-    ]
+    threshold = "" if finds_its_own else f", threshold {report['threshold']:g} px"
+    scored = " with scores" if report["scores"] else ""
+    lines = [f"{n} matches{scored}, {report['method']}{threshold}", ""]
     if report["cv2"] is not None and "plain cv2" not in times:
         lines.append(f"{'':<22}{'plain cv2':>12}")
         lines += [f"{name:<22}{a:>12}" for name, a in zip(names[1:], ours[1:], strict=True)]
@@ -566,7 +572,7 @@ def _for_people(report: dict[str, Any]) -> str:
     coherence, n_inliers = report["coherence"], report["n_inliers"]
     if report["F"] is not None and n_inliers <= MINIMAL + 1:
         lines += ["", f"Some F fits any {MINIMAL} matches: so few inliers say nothing."]
-    elif coherence is not None and coherence < COHERENT and 2 * n_inliers <= n:
+    elif coherence is not None and coherence < COHERENT and (finds_its_own or 2 * n_inliers <= n):
         lines += ["", "Images that have nothing in common have inliers of such coherence."]
     if report["F"] is not None:
         rows_of_F = ["  " + "".join(f"{value:>18.9e}" for value in row) for row in report["F"]]
@@ -630,14 +636,18 @@ def _draw(
     n_finite = len(rows)
     step = max(1, -(-len(rows) // _MAX_GRAPH_POINTS))
     rows = rows[::step]
+    peaks = density_peaks(X[rows])
+    share = peaks.gamma / (peaks.rho.max() * peaks.delta.max() or 1.0)
     figure = plotting.summary_figure(
         *images,
         X[rows],
         np.asarray(estimate.F),
         kept=estimate.kept[rows],
         mask=estimate.mask[rows],
-        peaks=density_peaks(X[rows]),
-        alpha=alpha,
+        reliability=estimate.reliability[rows],
+        peaks=peaks,
+        # Where the rule looked at others than these, its curve does not part them.
+        alpha=alpha if np.allclose(estimate.reliability[rows], share) else None,
     )
     if step > 1:
         figure.suptitle(f"1 in {step} of {n_finite} matches shown", fontsize=13)
@@ -697,10 +707,15 @@ def _run_demo(options: argparse.Namespace) -> int:
     with _stage("drawing", timings):
         images = (pair.image1, pair.image2)
         peaks = density_peaks(X)
+        classes: dict[str, Any] = {
+            "kept": found.kept,
+            "mask": found.mask,
+            "reliability": found.reliability,
+        }
         drawings: dict[str, tuple[float, Callable[[Any], object]]] = {
             "matches": (
                 6,
-                lambda ax: plotting.plot_matches(*images, X, found.kept, found.mask, ax=ax),
+                lambda ax: plotting.plot_matches(*images, X, **classes, ax=ax),
             ),
             "epipolar_lines": (
                 6,
@@ -708,9 +723,7 @@ def _run_demo(options: argparse.Namespace) -> int:
             ),
             "decision_graph": (
                 7,
-                lambda ax: plotting.plot_decision_graph(
-                    peaks, kept=found.kept, mask=found.mask, ax=ax
-                ),
+                lambda ax: plotting.plot_decision_graph(peaks, **classes, ax=ax),
             ),
         }
         for name, (height, draw) in drawings.items():

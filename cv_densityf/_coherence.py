@@ -29,7 +29,7 @@ def coherence(points1: ArrayLike, points2: ArrayLike, mask: ArrayLike | None = N
     -------
     float
         0 for matches paired at random, 1 where all sixteen nearest neighbours of each are the same
-        in the same order; a little below 0 by chance. NaN for fewer than three. Of more than 10,000
+        in the same order; a little below 0 by chance. NaN for fewer than three. Of 10,000 and more
         matches it is the mean over every second, third, ... one.
 
     Raises

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cv_densityf.plotting import _axes
+from cv_densityf.plotting import given_or_new
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -93,7 +93,7 @@ class DecisionGraphDisplay:
         ImportError
             If matplotlib is not installed.
         """
-        ax = _axes(ax, (6.4, 4.8))
+        ax = given_or_new(ax, (6.4, 4.8))
         rho, delta = np.asarray(self.rho, dtype=float), np.asarray(self.delta, dtype=float)
         is_center = np.zeros(len(rho), dtype=bool)
         centers = np.asarray([] if self.centers is None else self.centers)

@@ -35,6 +35,8 @@ _HEADERS = (
     ("x1", "y1", "x2", "y2"),
     ("x", "y", "u", "v"),
 )
+#: What pandas writes as a header where columns have no names, and what it should be.
+_NAMES = {"0,1,2,3": "x,y,x',y'", "0,1,2,3,4": "x,y,x',y',score"}
 
 
 class InputError(ValueError):
@@ -57,7 +59,8 @@ def read_matches(
         pixels, and optionally ``scores`` (or ``score``), (n,) or (n, 1); pickled objects are
         refused.
         ``.csv``: comma-separated columns x, y, x', y' and optionally a score; one header row of
-        these names is allowed. Up to ten million matches are read.
+        these names is allowed, and needed if the first match is 0,1,2,3 (and score 4), which
+        pandas writes as a header. Up to ten million matches are read.
 
     Returns
     -------
@@ -146,6 +149,11 @@ def _refusing(message: str) -> Iterator[None]:
 def _read_csv(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     rows = _csv_rows(path)
     first = next(rows, None)
+    if first is not None and (header := _NAMES.get(",".join(first[1]))):
+        raise InputError(
+            f"line {first[0]}: {','.join(first[1])} is a header as pandas writes it, or a match; "
+            f"put {header} in its place or, if it is a match, before it"
+        )
     if first is not None and not all(map(_is_number, first[1][0].split())):
         # As numpy's savetxt writes it.
         first[1][0] = first[1][0].removeprefix("#").strip()

@@ -62,6 +62,8 @@ def run_script(options: argparse.Namespace) -> int:
         atexit.register(_print_report)
     main = ModuleType("__main__")
     vars(main)["__builtins__"] = builtins
+    if sys.version_info < (3, 14):  # which makes it when it is asked for
+        vars(main)["__annotations__"] = {}
     sys.modules["__main__"] = main
     try:
         if options.module:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from numbers import Integral
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cv_densityf._arguments import real
+from cv_densityf._arguments import check, real
 
 Floats = NDArray[np.float64]
 
@@ -53,7 +54,8 @@ def epipolar_distance(
     Raises
     ------
     ValueError
-        If a matrix is not (3, 3), a size is not two positive numbers, or ``n`` is below 1.
+        If a matrix is not (3, 3), a size is not two positive numbers, or ``n`` is no integer of 1
+        and more.
 
     References
     ----------
@@ -70,8 +72,7 @@ def epipolar_distance(
     """
     F0, F1 = _matrix(F0, "F0"), _matrix(F1, "F1")
     whole1, whole2 = _size(size1, "size1"), _size(size2, "size2")
-    if n < 1:
-        raise ValueError(f"n is {n}; draw at least one point")
+    check("n", n, Integral, lambda v: v >= 1, "an integer of 1 and more")
     scales = [float(np.abs(F).max()) for F in (F0, F1)]
     if not all(0 < scale < np.inf for scale in scales):
         return np.inf
@@ -138,7 +139,7 @@ def _matrix(F: ArrayLike, name: str) -> Floats:
 
 
 def _size(size: Sequence[float], name: str) -> Floats:
-    array = np.asarray(size, dtype=np.float64)
+    array = real(size, name)
     if array.shape != (2,) or not ((array > 0) & np.isfinite(array)).all():
         given = size if array.size <= 4 else f"of shape {array.shape}"
         raise ValueError(f"{name} is {given}; it must be (width, height), pixels, above 0")

@@ -9,6 +9,7 @@ from concurrent.futures import BrokenExecutor, Future
 from contextlib import contextmanager
 from copy import copy
 from importlib.util import find_spec
+from pickle import PicklingError
 from typing import Any
 
 import numpy as np
@@ -49,9 +50,9 @@ def estimate_many(
     -------
     iterator of Estimate
         In the order of ``pairs``. Each equals what `estimate_fundamental` makes of the pair with
-        these options, whatever ``n_jobs`` and ``backend`` are. A pair that cannot be estimated, or
-        whose worker process died of it, gets a falsy `Estimate` whose ``reason`` says so; the
-        others go on.
+        these options, whatever ``n_jobs`` and ``backend`` are. A pair that cannot be estimated or
+        sent to a worker process, or whose worker process died of it, gets a falsy `Estimate` whose
+        ``reason`` says so; the others go on.
 
     Raises
     ------
@@ -102,10 +103,11 @@ def _estimates(
             for estimate in _answers(run, source, options):
                 source.pending.popleft()
                 yield estimate
-        except BrokenExecutor:
+        except (BrokenExecutor, PicklingError):
             # Any of the unfinished pairs may be the one to blame.
             while source.pending:
                 yield _alone(source.pending.popleft(), options)
+            # The old one would still give what it had of these.
             run = _runner(n_jobs, backend)
         if source.error is not None:
             raise source.error
@@ -153,14 +155,28 @@ def _answers(run: Any, pairs: Iterable[Pair], options: dict[str, Any]) -> Iterat
 
 
 def _with_losses_told(backend: Any) -> Any:
-    """Give a copy of joblib's dask backend that tells of tasks the scheduler has given up.
+    """Give a copy of joblib's dask backend that tells of tasks lost on the way or given up.
 
     As of joblib 1.6 nobody is called back for them, so that whoever waits for the result waits for
     ever.
     """
+    from distributed.protocol import pickle
     from distributed.scheduler import KilledWorker
 
+    dumps: Any = pickle.dumps
+
     class Telling(type(backend)):  # type: ignore[misc]
+        def effective_n_jobs(self, n_jobs: Any) -> Any:
+            # One job, where one worker is left, would not leave this process.
+            return max(2, super().effective_n_jobs(n_jobs))
+
+        async def _to_func_args(self, func: Any) -> Any:
+            try:
+                dumps(func.items, buffer_callback=lambda _: None)  # copies no array
+            except Exception:
+                func.items = [(_refuse, (), {})]
+            return await super()._to_func_args(func)
+
         def submit(self, func: Any, callback: Callable[[Any], None]) -> Future[Any]:
             def tell(done: Future[Any]) -> None:
                 if done.exception() is not None:
@@ -181,6 +197,10 @@ def _with_losses_told(backend: Any) -> Any:
     telling = copy(backend)
     telling.__class__ = Telling
     return telling
+
+
+def _refuse() -> None:
+    raise PicklingError
 
 
 def _one(pair: Pair, options: dict[str, Any]) -> Estimate:
@@ -205,6 +225,8 @@ def _alone(pair: Pair, options: dict[str, Any]) -> Estimate:
     try:
         # One job would not leave this process.
         (estimate,) = _answers(_runner(2, "loky"), [pair], options)
+    except PicklingError:
+        return _failure(pair, "it cannot be pickled for a worker process; give NumPy arrays")
     except BrokenExecutor as error:
         return _failure(
             pair,

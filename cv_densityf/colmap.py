@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from cv_densityf._arguments import check
 from cv_densityf._coherence import coherence
+from cv_densityf._engine import METHODS, method_flag
 from cv_densityf._estimate import Estimate
 from cv_densityf._files import InputError
 from cv_densityf._prefilter import COHERENT
@@ -38,6 +39,8 @@ _CHUNK = 256
 _CACHED_IMAGES = 512
 #: What comes of a pair.
 _VERIFIED, _FEW, _INCOHERENT = "verified", "few inliers", "incoherent"
+#: To these at least half of the matches are inliers, whatever they are.
+_WITHOUT_THRESHOLD = {METHODS[name] for name in ("7point", "8point", "lmeds")}
 #: Seconds to wait for another program's lock.
 _PATIENCE = 5.0
 
@@ -103,7 +106,8 @@ def verify_matches(
         is 15.
     min_coherence : float
         Likewise a pair whose inliers have less of `coherence`, at most 1: wrong matches, of which
-        some are always within 4 pixels of their lines. Not asked for where most are inliers.
+        some are always within 4 pixels of their lines. Not asked for where most are inliers,
+        unless by ``"lmeds"``, ``"7point"`` or ``"8point"``, to which most always are.
     n_jobs : int, optional
         Pairs at a time, as in `estimate_many`; -1 for one per core.
     resume : bool
@@ -114,7 +118,7 @@ def verify_matches(
     progress : bool, optional
         Show a bar on standard error. By default if that is a terminal and tqdm is installed.
     **options
-        Further options of `estimate_fundamental`.
+        Further options of `estimate_fundamental`, all but ``scores``.
 
     Returns
     -------
@@ -145,6 +149,8 @@ def verify_matches(
     """
     check("min_inliers", min_inliers, Integral, lambda v: v >= 8, "an integer of 8 and more")
     check("min_coherence", min_coherence, Real, lambda v: v <= 1, "a number up to 1")
+    if "scores" in options:
+        raise TypeError("scores cannot be given: a COLMAP database has no place for them")
     asked: dict[str, Any] = {
         "n_jobs": n_jobs, "progress": False, "method": method, "threshold": threshold, **options
     }  # fmt: skip
@@ -153,6 +159,7 @@ def verify_matches(
         n_pairs = _check(connection)
         # Checks the options, also where there is nothing left to do.
         estimate_many((), **asked)
+        most_will_do = method_flag(method) not in _WITHOUT_THRESHOLD
         where = "WHERE pair_id NOT IN (SELECT pair_id FROM two_view_geometries)" if resume else ""
         todo = [
             pair_id
@@ -176,9 +183,9 @@ def verify_matches(
                     update()
                     n_matches += len(matches)
                     if estimate.engine == "none":
-                        failures.append((*_image_ids(pair_id), estimate.reason))
+                        failures.append((*image_ids(pair_id), estimate.reason))
                         continue
-                    verdict = _verdict(points, estimate, min_inliers, min_coherence)
+                    verdict = _verdict(points, estimate, min_inliers, min_coherence, most_will_do)
                     verdicts[verdict] += 1
                     row = _row(pair_id, matches, estimate if verdict == _VERIFIED else None)
                     n_inliers += row[1]
@@ -266,7 +273,7 @@ def _load(
     """Read the matches of a pair, (m, 2) indices, and the points they join."""
     (data,) = connection.execute("SELECT data FROM matches WHERE pair_id = ?", [pair_id]).fetchone()
     matches = np.frombuffer(data or b"", dtype=np.uint32).reshape(-1, 2)
-    image_id1, image_id2 = _image_ids(pair_id)
+    image_id1, image_id2 = image_ids(pair_id)
     first, second = keypoints(image_id1), keypoints(image_id2)
     if len(matches) and (matches.max(axis=0) >= (len(first), len(second))).any():
         raise InputError(
@@ -287,7 +294,8 @@ def _keypoints(connection: sqlite3.Connection, image_id: int) -> NDArray[np.floa
     return np.frombuffer(data, dtype=np.float32).reshape(-1, cols)[:, :2].copy()
 
 
-def _image_ids(pair_id: int) -> tuple[int, int]:
+def image_ids(pair_id: int) -> tuple[int, int]:
+    """Split COLMAP's number of a pair into those of its images."""
     return divmod(pair_id, _PAIR_BASE)
 
 
@@ -296,12 +304,13 @@ def _verdict(
     estimate: Estimate,
     min_inliers: int,
     min_coherence: float,
+    most_will_do: bool,
 ) -> str:
-    """Whether there is one F with enough inliers, and these are most of the matches or coherent."""
+    """Whether there are enough inliers, and these coherent or, if that will do, most matches."""
     n = estimate.n_inliers
-    if estimate.F is None or estimate.F.shape != (3, 3) or n < min_inliers:
+    if n < min_inliers:
         return _FEW
-    most = 2 * n > len(estimate.mask)
+    most = most_will_do and 2 * n > len(estimate.mask)
     coherent = most or coherence(*points, estimate.mask) >= min_coherence
     return _VERIFIED if coherent else _INCOHERENT
 
@@ -319,8 +328,8 @@ def _row(
 
 def _write(connection: sqlite3.Connection, rows: list[Any], replace: bool) -> None:
     """Write two-view geometries in one transaction; with ``replace`` drop the old of all pairs."""
-    connection.execute("BEGIN IMMEDIATE")
-    try:
+    with connection:
+        connection.execute("BEGIN IMMEDIATE")
         if replace:
             connection.execute(
                 "DELETE FROM two_view_geometries WHERE pair_id IN (SELECT pair_id FROM matches)"
@@ -330,7 +339,3 @@ def _write(connection: sqlite3.Connection, rows: list[Any], replace: bool) -> No
             "VALUES (?, ?, 2, ?, ?, ?)",
             rows,
         )
-        connection.execute("COMMIT")
-    except BaseException:
-        connection.execute("ROLLBACK")
-        raise

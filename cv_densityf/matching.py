@@ -20,6 +20,8 @@ MAX_FEATURES = 8000
 
 #: Largest file that OpenCV decodes.
 _MAX_BYTES = 2**31 - 1
+#: How a JPEG file begins, and end marks to fill the longest segment there is.
+_JPEG, _JPEG_END = b"\xff\xd8", 2**15 * b"\xff\xd9"
 #: Rows of the similarity matrix held in memory at a time.
 _CHUNK = 1024
 
@@ -99,9 +101,14 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[Any]:
         raise InputError(f"{os.fspath(path)}: larger than the 2 GB that OpenCV can decode")
     # Not cv2.imread: it writes its own warnings, and cannot tell a missing file from a bad one.
     with open(path, "rb") as stream:  # which may be a pipe
-        data = np.frombuffer(stream.read(), dtype=np.uint8)
+        data = stream.read()
+    if data.startswith(_JPEG):
+        # As libjpeg does with a file that is cut off, for imread but not for imdecode.
+        data += _JPEG_END
     try:
-        image = cv2.imdecode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR)
+        image = cv2.imdecode(
+            np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR
+        )
     except cv2.error:
         image = None
     if image is None:
@@ -146,20 +153,20 @@ def detect(
     for name, value in (("max_size", max_size), ("max_features", max_features)):
         if value is not None:
             check(name, value, Integral, lambda v: v >= 1, "an integer of 1 and more, or None")
-    grey: NDArray[Any] = _grey(image)
-    height, width = grey.shape
+    pixels: NDArray[Any] = grey(image)
+    height, width = pixels.shape
     scale = 1.0 if max_size is None else min(1.0, max_size / max(height, width))
     if scale < 1:
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        pixels = cv2.resize(pixels, size, interpolation=cv2.INTER_AREA)
     # Without precise upscaling every point is off by a quarter of a pixel.
     sift = cv2.SIFT.create(nfeatures=max_features or 0, enable_precise_upscale=True)
-    keypoints, descriptors = sift.detectAndCompute(grey, None)
+    keypoints, descriptors = sift.detectAndCompute(pixels, None)
     if not keypoints:
         empty = np.empty((0, 128), dtype=np.float32)
         return Features(np.empty((0, 2)), empty, (width, height))
     points = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64)
-    shrunk = np.array([width / grey.shape[1], height / grey.shape[0]])
+    shrunk = np.array([width / pixels.shape[1], height / pixels.shape[0]])
     points = (points + 0.5) * shrunk - 0.5
     descriptors = descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-12)
     return Features(points, np.sqrt(descriptors, dtype=np.float32), (width, height))
@@ -269,7 +276,8 @@ def match_images(
     return match_features(features1, features2, ratio=ratio, mutual=mutual)
 
 
-def _grey(image: NDArray[Any]) -> NDArray[np.uint8]:
+def grey(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return any image that `detect` takes as (h, w) uint8, or raise TypeError or ValueError."""
     if not isinstance(image, np.ndarray):
         raise TypeError(
             f"an image must be a NumPy array, not {type(image).__name__}; "
@@ -288,8 +296,8 @@ def _grey(image: NDArray[Any]) -> NDArray[np.uint8]:
     if image.dtype != np.uint8:
         image = _stretched(image)
     image = np.ascontiguousarray(image)
-    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
-    return np.asarray(grey, dtype=np.uint8)
+    shades = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    return np.asarray(shades, dtype=np.uint8)
 
 
 def _stretched(image: NDArray[Any]) -> NDArray[np.uint8]:

@@ -7,6 +7,7 @@ difference matters, marker shapes or numbers show it as well.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
@@ -14,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cv_densityf._arguments import check_mask
+from cv_densityf._arguments import check_mask, real
 from cv_densityf._zhang import points_inside
-from cv_densityf.matching import _grey
+from cv_densityf.matching import grey
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,6 +30,8 @@ _LINE_COLORS = (
 )
 #: Between two images, as a share of the first one's width.
 _GAP = 0.02
+#: At most so many times as wide as the other is an image shown.
+_WIDER = 4.0
 
 
 class _Peaks(Protocol):
@@ -42,7 +45,7 @@ class _Peaks(Protocol):
 
 @dataclass(frozen=True)
 class _Style:
-    """How one class of matches is drawn."""
+    """How one class of matches is drawn; ``line`` is the width of the lines that join points."""
 
     label: str
     color: str
@@ -50,15 +53,22 @@ class _Style:
     size: float
     edge: float
     alpha: float
-    order: int
+    line: float
 
 
+#: By what density says of a match, and whether it is an inlier; the least important first. Where it
+#: keeps all, it says nothing, and they are just "matches".
 _STYLES = {
-    # (kept, inlier)
-    (False, False): _Style("dropped", "#333333", ".", 5.0, 0.0, 0.6, 2),
-    (True, False): _Style("kept, not an inlier", "#D55E00", "x", 5.0, 1.4, 0.9, 3),
-    (True, True): _Style("kept, inlier", "#0072B2", "o", 4.5, 0.0, 0.9, 4),
-    (False, True): _Style("dropped, yet inlier", "#56B4E9", "^", 5.5, 0.0, 1.0, 5),
+    ("not looked at", False): _Style(
+        "not looked at, not an inlier", "#333333", "+", 4.0, 0.8, 0.6, 0.6
+    ),
+    ("dropped", False): _Style("dropped", "#333333", ".", 5.0, 0.0, 0.6, 0.6),
+    ("not looked at", True): _Style("not looked at, inlier", "#56B4E9", "D", 4.0, 0.0, 1.0, 1.0),
+    ("kept", False): _Style("kept, not an inlier", "#D55E00", "x", 5.0, 1.4, 0.9, 1.0),
+    ("matches", False): _Style("not an inlier", "#D55E00", "x", 5.0, 1.4, 0.9, 1.0),
+    ("kept", True): _Style("kept, inlier", "#0072B2", "o", 4.5, 0.0, 0.9, 1.0),
+    ("matches", True): _Style("inlier", "#0072B2", "o", 4.5, 0.0, 0.9, 1.0),
+    ("dropped", True): _Style("dropped, yet inlier", "#56B4E9", "^", 5.5, 0.0, 1.0, 1.0),
 }
 
 
@@ -68,9 +78,12 @@ def plot_decision_graph(
     alpha: float | None = None,
     kept: ArrayLike | None = None,
     mask: ArrayLike | None = None,
+    reliability: ArrayLike | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the decision graph: distance to a denser match against density.
+
+    The density is the number of matches closer than the cut-off distance dc.
 
     Parameters
     ----------
@@ -83,6 +96,9 @@ def plot_decision_graph(
         Matches of the dense part; by default those on or above the curve, all without one.
     mask : (n,) array of bool, optional
         Inliers of the final fundamental matrix; by default they are not told apart.
+    reliability : (n,) array, optional
+        That of an `Estimate`, NaN for matches whose density was not looked at; by default it was
+        looked at for all.
     ax : matplotlib.axes.Axes, optional
         Where to draw; by default a new figure.
 
@@ -95,7 +111,8 @@ def plot_decision_graph(
     ImportError
         If matplotlib is not installed.
     ValueError
-        If ``kept`` or ``mask`` has another length than ``peaks``, or negative numbers or NaN.
+        If ``kept``, ``mask`` or ``reliability`` has another length than ``peaks``, or one of the
+        first two has negative numbers or NaN.
 
     References
     ----------
@@ -110,33 +127,36 @@ def plot_decision_graph(
     >>> peaks = SimpleNamespace(rho=np.array([9, 5, 1]), delta=np.array([80.0, 3.0, 40.0]))
     >>> ax = plot_decision_graph(peaks, mask=[True, False, False])
     >>> ax.get_xlabel()
-    'rho, density: matches closer than the cut-off distance'
+    'rho, density: matches within dc'
     """
     rho, delta = np.asarray(peaks.rho), np.asarray(peaks.delta)
     product = (alpha or 0.0) * rho.max(initial=0) * delta.max(initial=0)
     on_or_above: NDArray[np.bool_] = rho * delta >= product
     kept = on_or_above if kept is None else check_mask(kept, len(rho), "kept")
     mask = None if mask is None else check_mask(mask, len(rho), "mask")
-    ax = _axes(ax, (16, 7))
+    unseen = _unseen(reliability, len(rho))
+    ax = given_or_new(ax, (16, 7))
     handles = []
-    for style, rows in _classes(kept, mask):
+    for order, (style, rows) in enumerate(_classes(kept, mask, unseen)):
         (handle,) = ax.plot(
             rho[rows], delta[rows], ls="none", marker=style.marker, color=style.color,
-            ms=style.size, mew=style.edge, alpha=style.alpha, zorder=style.order,
+            ms=style.size, mew=style.edge, alpha=style.alpha, zorder=2 + order,
             label=f"{style.label} ({len(rows)})",
         )  # fmt: skip
         handles.append(handle)
-    ax.set_yscale("symlog", linthresh=1)
     if rho.max(initial=0) > 0 and delta.max() > 0:
         top, right = 1.5 * delta.max(), 1.03 * rho.max()
-        bottom = 0.7 * delta.min() if delta.min() > 0 else -0.2
+        # Three decades are logarithmic, in whatever units the points are.
+        linear = delta.max() / 1000
+        ax.set_yscale("symlog", linthresh=linear)
+        bottom = 0.7 * delta.min() if delta.min() > linear else -0.2 * linear
         ax.set(xlim=(-0.02 * right, right), ylim=(bottom, top))
         if product > 0:
             x = np.geomspace(product / top, right, 400)
-            label = f"rho x delta = {alpha:g} x max rho x max delta"
-            handles += ax.plot(x, product / x, "k--", lw=1.6, zorder=6, label=label)
-    ax.set_xlabel("rho, density: matches closer than the cut-off distance")
-    ax.set_ylabel("delta, distance to a denser match (px)")
+            label = rf"$\rho\,\delta = {alpha:g}\;\rho_{{max}}\,\delta_{{max}}$"
+            handles += ax.plot(x, product / x, "k--", lw=1.6, zorder=9, label=label)
+    ax.set_xlabel("rho, density: matches within dc")
+    ax.set_ylabel("delta, distance to a denser match")
     ax.grid(alpha=0.25)
     _legend_above(ax, handles)
     return ax
@@ -149,6 +169,7 @@ def plot_matches(
     kept: ArrayLike | None = None,
     mask: ArrayLike | None = None,
     *,
+    reliability: ArrayLike | None = None,
     max_lines: int = 150,
     ax: Axes | None = None,
 ) -> Axes:
@@ -161,9 +182,12 @@ def plot_matches(
     X : (n, 4) array
         The columns x, y, x', y', in pixels; rows that are not finite are left out.
     kept : (n,) array of bool, optional
-        Matches of the dense part; by default all.
+        Matches of the dense part; by default all. Where all are, the legend is only about inliers.
     mask : (n,) array of bool, optional
         Inliers of the final fundamental matrix; by default they are not told apart.
+    reliability : (n,) array, optional
+        That of an `Estimate`, NaN for matches whose density was not looked at; by default it was
+        looked at for all.
     max_lines : int
         Every match gets its two points; about this many, evenly chosen, also get the line that
         joins them.
@@ -178,8 +202,8 @@ def plot_matches(
     ------
     ImportError
         If matplotlib is not installed.
-    ValueError
-        If a shape does not fit.
+    TypeError, ValueError
+        If an argument is no image, or a shape does not fit.
 
     Examples
     --------
@@ -188,15 +212,16 @@ def plot_matches(
     >>> scene = two_view_scene(100)
     >>> ax = plot_matches(None, None, scene.X, mask=scene.inliers)
     >>> [text.get_text() for text in ax.get_legend().get_texts()]
-    ['kept, not an inlier (60)', 'kept, inlier (40)']
+    ['not an inlier (60)', 'inlier (40)']
     """
-    X = _matches(X)
+    X, greys = _matches(X), _greys(image1, image2)
     finite = _finite(X)
     kept = finite if kept is None else check_mask(kept, len(X), "kept")
     mask = None if mask is None else check_mask(mask, len(X), "mask")[finite]
+    unseen = _unseen(reliability, len(X))[finite]
     X, kept = X[finite], kept[finite]
-    ax = _axes(ax, (16, 6))
-    place1, place2 = _show(ax, image1, image2, X)
+    ax = given_or_new(ax, (16, 6))
+    place1, place2 = _show(ax, greys, X)
     shown1, shown2 = place1(X[:, :2]), place2(X[:, 2:])
 
     from matplotlib.collections import LineCollection
@@ -204,19 +229,18 @@ def plot_matches(
     lined = np.zeros(len(X), dtype=bool)
     lined[:: max(1, -(-len(X) // max(1, max_lines)))] = max_lines > 0
     handles = []
-    for style, rows in _classes(kept, mask):
-        strong = style.label != "dropped"
+    for order, (style, rows) in enumerate(_classes(kept, mask, unseen)):
         joined = rows[lined[rows]]
         segments = np.stack([shown1[joined], shown2[joined]], axis=1)
         lines = LineCollection(
-            list(segments), colors=style.color, linewidths=1.0 if strong else 0.6,
-            alpha=0.75 if strong else 0.5, zorder=style.order,
+            list(segments), colors=style.color, linewidths=style.line,
+            alpha=0.8 * style.alpha, zorder=2 + order,
         )  # fmt: skip
         ax.add_collection(lines, autolim=False)
         (handle,) = ax.plot(
             *np.vstack([shown1[rows], shown2[rows]]).T, ls="none", marker=style.marker,
             ms=style.size, mew=style.edge, color=style.color, alpha=style.alpha,
-            zorder=style.order + 10, label=f"{style.label} ({len(rows)})",
+            zorder=12 + order, label=f"{style.label} ({len(rows)})",
         )  # fmt: skip
         handles.append(handle)
     _legend_above(ax, handles)
@@ -258,8 +282,8 @@ def plot_epipolar_lines(
     ------
     ImportError
         If matplotlib is not installed.
-    ValueError
-        If a shape does not fit.
+    TypeError, ValueError
+        If an argument is no image, or a shape does not fit.
 
     Examples
     --------
@@ -270,13 +294,13 @@ def plot_epipolar_lines(
     >>> sorted({text.get_text() for text in ax.texts})
     ['1', '2', '3', '4', '5']
     """
-    X, F = _matches(X), np.asarray(F, dtype=np.float64)
+    X, F, greys = _matches(X), real(F, "F"), _greys(image1, image2)
     if F.shape != (3, 3):
         raise ValueError(f"F must have the shape (3, 3), not {F.shape}")
     finite = _finite(X)
     mask = finite if mask is None else check_mask(mask, len(X), "mask")
-    ax = _axes(ax, (16, 6))
-    places = _show(ax, image1, image2, X[finite])
+    ax = given_or_new(ax, (16, 6))
+    places = _show(ax, greys, X[finite])
     for number, row in enumerate(_far_apart(X, np.flatnonzero(mask & finite), n_lines)):
         color = _LINE_COLORS[number % len(_LINE_COLORS)]
         point1, point2 = X[row, :2], X[row, 2:]
@@ -304,6 +328,7 @@ def summary_figure(
     *,
     kept: ArrayLike,
     mask: ArrayLike,
+    reliability: ArrayLike | None = None,
     peaks: _Peaks,
     alpha: float | None = None,
 ) -> Figure:
@@ -319,6 +344,8 @@ def summary_figure(
         Fundamental matrix.
     kept, mask : (n,) array of bool
         Matches of the dense part, and inliers of ``F``.
+    reliability : (n,) array, optional
+        That of an `Estimate`, NaN for matches whose density was not looked at.
     peaks : DensityPeaksResult
         Density peaks of ``X``.
     alpha : float, optional
@@ -336,10 +363,12 @@ def summary_figure(
     """
     figure = new_figure(16, 18)
     axes = figure.subplots(3, 1)
-    plot_matches(image1, image2, X, kept, mask, ax=axes[0])
+    plot_matches(image1, image2, X, kept, mask, reliability=reliability, ax=axes[0])
     plot_epipolar_lines(image1, image2, X, F, mask, ax=axes[1])
     axes[1].set_title("Epipolar lines of a few inliers", fontsize=13)
-    plot_decision_graph(peaks, alpha=alpha, kept=kept, mask=mask, ax=axes[2])
+    plot_decision_graph(
+        peaks, alpha=alpha, kept=kept, mask=mask, reliability=reliability, ax=axes[2]
+    )
     return figure
 
 
@@ -383,7 +412,8 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), dpi=100, layout="constrained")
 
 
-def _axes(ax: Axes | None, size: tuple[float, float]) -> Axes:
+def given_or_new(ax: Axes | None, size: tuple[float, float]) -> Axes:
+    """Return the axes, or those of a new figure of pyplot of this size, hundreds of pixels."""
     if ax is not None:
         return ax
     require_matplotlib()
@@ -393,7 +423,7 @@ def _axes(ax: Axes | None, size: tuple[float, float]) -> Axes:
 
 
 def _matches(X: ArrayLike) -> NDArray[np.float64]:
-    X = np.asarray(X, dtype=np.float64)
+    X = real(X, "X")
     if X.ndim != 2 or X.shape[1] != 4:
         raise ValueError(f"X must have the shape (n, 4), the columns x, y, x', y', not {X.shape}")
     return X
@@ -403,20 +433,30 @@ def _finite(X: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(X).all(axis=1))
 
 
+def _greys(
+    image1: NDArray[Any] | None, image2: NDArray[Any] | None
+) -> list[NDArray[np.uint8] | None]:
+    return [None if image is None else grey(image) for image in (image1, image2)]
+
+
+def _unseen(reliability: ArrayLike | None, n: int) -> NDArray[np.bool_]:
+    if reliability is None:
+        return np.zeros(n, dtype=bool)
+    return check_mask(np.isnan(real(reliability, "reliability")), n, "reliability")
+
+
 def _classes(
-    kept: NDArray[np.bool_], mask: NDArray[np.bool_] | None
+    kept: NDArray[np.bool_], mask: NDArray[np.bool_] | None, unseen: NDArray[np.bool_]
 ) -> Iterator[tuple[_Style, NDArray[np.intp]]]:
     """Yield the style and the rows of each class that has any, the least important first."""
-    for (is_kept, is_inlier), style in _STYLES.items():
-        if mask is None:
-            # Nothing is known of inliers: neither claim them nor deny them.
-            style = replace(style, label="kept" if is_kept else "dropped")
-            chosen = (kept == is_kept) if is_kept == is_inlier else np.zeros_like(kept)
-        else:
-            chosen = (kept == is_kept) & (mask == is_inlier)
-        rows = np.flatnonzero(chosen)
+    said = np.select([kept, unseen], ["kept", "not looked at"], "dropped")
+    if kept.all():
+        said[:] = "matches"
+    for (name, is_inlier), style in _STYLES.items():
+        rows = np.flatnonzero((said == name) & ((kept if mask is None else mask) == is_inlier))
         if len(rows):
-            yield style, rows
+            # Where nothing is known of inliers, neither claim them nor deny them.
+            yield (replace(style, label=name) if mask is None else style), rows
 
 
 @dataclass(frozen=True)
@@ -436,25 +476,26 @@ class _Place:
 
 
 def _show(
-    ax: Axes, image1: NDArray[Any] | None, image2: NDArray[Any] | None, X: NDArray[np.float64]
+    ax: Axes, greys: list[NDArray[np.uint8] | None], X: NDArray[np.float64]
 ) -> tuple[_Place, _Place]:
-    """Show the images side by side, equally high."""
-    extent1, extent2 = _extent(image1, X[:, :2]), _extent(image2, X[:, 2:])
-    width, height = extent1[1] - extent1[0]
-    scale = height / (extent2[1, 1] - extent2[0, 1])
+    """Show the images side by side, equally high unless one would be a speck beside the other."""
+    extent1, extent2 = _extent(greys[0], X[:, :2]), _extent(greys[1], X[:, 2:])
+    (width, height), (width2, height2) = extent1[1] - extent1[0], extent2[1] - extent2[0]
+    same_width = width / width2
+    scale = np.clip(height / height2, same_width / _WIDER, same_width * _WIDER)
     shift2 = np.array([(1 + _GAP) * width, 0]) - scale * extent2[0]
     places = _Place(extent1, 1.0, -extent1[0]), _Place(extent2, scale, shift2)
-    for image, place in zip((image1, image2), places, strict=True):
+    for image, place in zip(greys, places, strict=True):
         (left, top), (right, bottom) = place(place.extent)
         if image is not None:
             # Only the light greys: lines and points stay visible on them.
             ax.imshow(
-                _grey(image), cmap="gray", vmin=-450, vmax=255, extent=(left, right, bottom, top),
+                image, cmap="gray", vmin=-450, vmax=255, extent=(left, right, bottom, top),
                 interpolation="antialiased", zorder=0,
             )  # fmt: skip
         frame = np.array([[left, right, right, left, left], [top, top, bottom, bottom, top]])
         ax.plot(*frame, color="0.4", lw=1, zorder=1, clip_on=False)
-    ax.set(xlim=(0, places[1](extent2)[1, 0]), ylim=(height, 0), aspect="equal")
+    ax.set(xlim=(0, right), ylim=(max(height, scale * height2), 0), aspect="equal")
     ax.axis("off")
     return places
 
@@ -473,11 +514,27 @@ def _extent(image: NDArray[Any] | None, points: NDArray[np.float64]) -> NDArray[
 
 
 def _legend_above(ax: Axes, handles: list[Any]) -> None:
-    if handles:
-        ax.legend(
-            handles=handles, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=5,
-            frameon=False, fontsize=11, markerscale=1.6, columnspacing=1.5,
+    """Put a legend above the axes that is no wider than they are and ends within the figure."""
+    if not handles:
+        return
+    figure, layout = ax.figure, ax.figure.get_layout_engine()
+    if layout is not None:
+        layout.execute(figure.figure)  # which tells how wide the axes are
+    width = ax.get_position(original=True).width * figure.bbox.width
+    for size, n_lines in [*itertools.product((11, 9, 7), (1, 2, 3, 4)), (7, len(handles))]:
+        legend = ax.legend(
+            handles=handles, loc="lower center", bbox_to_anchor=(0.5, 1.0),
+            ncols=-(-len(handles) // n_lines), frameon=False, fontsize=size, markerscale=1.6,
+            columnspacing=1.5,
         )  # fmt: skip
+        if legend.get_window_extent().width <= width:
+            break
+    if layout is None:
+        ax.apply_aspect()  # which tells where the legend will be
+        over = (legend.get_window_extent().y1 - figure.bbox.y1) / figure.bbox.height
+        if over > 0:
+            left, bottom, width, height = ax.get_position(original=True).bounds
+            ax.set_position((left, bottom, width, height - over))
 
 
 def _far_apart(X: NDArray[np.float64], rows: NDArray[np.intp], n: int) -> list[int]:

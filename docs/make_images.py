@@ -15,7 +15,7 @@ from matplotlib import pyplot as plt
 from PIL import Image
 from scipy.spatial import cKDTree
 
-from cv_densityf import density_peaks, estimate_fundamental
+from cv_densityf import Estimate, density_peaks, estimate_fundamental
 from cv_densityf._epipolar import sampson_distance
 from cv_densityf._prefilter import N_NEIGHBORS, contrast_support
 from cv_densityf.datasets import motorcycle
@@ -41,18 +41,19 @@ def main(folder: Path) -> None:
     )
     mpl.rcParams.update({"font.size": 11, "axes.titlesize": 12})
     photographs = (pair.image1, pair.image2, X)
+    classes = {
+        "kept": estimate.kept, "mask": estimate.mask, "reliability": estimate.reliability
+    }  # fmt: skip
     pictures = {
-        "matches": page_wide(4.1, plot_matches, *photographs, estimate.kept, estimate.mask),
+        "matches": page_wide(4.1, plot_matches, *photographs, **classes),
         "epipolar_lines": page_wide(
             3.8, plot_epipolar_lines, *photographs, estimate.F, estimate.mask
         ),
-        "decision_graph": page_wide(
-            5, plot_decision_graph, density_peaks(X), kept=estimate.kept, mask=estimate.mask
-        ),
+        "decision_graph": page_wide(5, plot_decision_graph, density_peaks(X), **classes),
         "how-neighbours": neighbours(greys, X, right),
         "how-contrast": contrast(greys[0], X, right),
         "how-vote": vote(greys[0], X[estimate.mask]),
-        "how-mask": mask(greys[0], X, estimate.kept, estimate.mask),
+        "how-mask": mask(greys[0], X, estimate),
     }
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in pictures.items():
@@ -69,12 +70,6 @@ def page_wide(
     """Draw one of the package's plots in the width of a page, so that its letters can be read."""
     figure, ax = plt.subplots(figsize=(10, height), layout="constrained")
     plot(*args, **kwargs, ax=ax)
-    if ax.get_legend() is not None:
-        columns = 4 if len(ax.get_legend().legend_handles) == 4 else 3
-        ax.legend(
-            loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=columns, frameon=False,
-            markerscale=1.4, columnspacing=1.2,
-        )  # fmt: skip
     return figure
 
 
@@ -165,17 +160,27 @@ def vote(grey: np.ndarray, inliers: np.ndarray, cells: int = 16) -> plt.Figure:
     return figure
 
 
-def mask(grey: np.ndarray, X: np.ndarray, kept: np.ndarray, inliers: np.ndarray) -> plt.Figure:
+def mask(grey: np.ndarray, X: np.ndarray, estimate: Estimate) -> plt.Figure:
     """Show the dense half, and the inliers in the end."""
+    kept, inliers, unseen = estimate.kept, estimate.mask, np.isnan(estimate.reliability)
+    dropped = ~kept & ~unseen
     figure, axes = plt.subplots(1, 2, figsize=(12, 4.4), layout="constrained")
     panels = (
-        ("by density", [("kept", kept, BLUE, "o"), ("dropped", ~kept, DARK, "x")]),
+        (
+            "by density",
+            [
+                ("kept", kept, BLUE, "o"),
+                ("dropped", dropped, DARK, "x"),
+                ("not looked at", unseen, DARK, "+"),
+            ],
+        ),
         (
             "in the end",
             [
                 ("kept, inlier", kept & inliers, BLUE, "o"),
-                ("dropped, yet inlier", ~kept & inliers, SKY, "^"),
                 ("kept, not an inlier", kept & ~inliers, RED, "x"),
+                ("dropped, yet inlier", dropped & inliers, SKY, "^"),
+                ("not looked at, inlier", unseen & inliers, SKY, "D"),
             ],
         ),
     )
@@ -187,7 +192,7 @@ def mask(grey: np.ndarray, X: np.ndarray, kept: np.ndarray, inliers: np.ndarray)
                 label=f"{name} ({rows.sum()})",
             )  # fmt: skip
         ax.legend(
-            loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=3, frameon=False,
+            loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=2, frameon=False,
             fontsize=10, columnspacing=1, handletextpad=0.1,
         )  # fmt: skip
     return figure

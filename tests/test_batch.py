@@ -80,6 +80,7 @@ def test_scores_belong_to_the_pair(pairs):
 def test_a_bad_pair_fails_alone(pairs, n_jobs):
     points1, points2 = pairs[1]
     bad = [
+        (cv2.UMat(points1.astype(np.float32)), points2),
         (points1, points2[:-1]),
         (points1[:3], points2[:3]),
         (points1,),
@@ -91,9 +92,10 @@ def test_a_bad_pair_fails_alone(pairs, n_jobs):
     found = list(estimate_many([pairs[0], *bad, pairs[2]], n_jobs=n_jobs))
     assert [bool(estimate) for estimate in found] == [True, *[False] * len(bad), True]
     assert same(found[-1], estimate_fundamental(*pairs[2]))
-    assert found[1].reason.startswith("ValueError: points1 has")
-    assert found[1].mask.shape == (len(points1),)
-    assert found[2].mask.shape == found[2].kept.shape == (3,)
+    assert ("cannot be pickled" in found[1].reason) == (n_jobs == 2)
+    assert found[2].reason.startswith("ValueError: points1 has")
+    assert found[2].mask.shape == (len(points1),)
+    assert found[3].mask.shape == found[3].kept.shape == (3,)
     assert not any(np.shares_memory(estimate.mask, estimate.kept) for estimate in found)
     assert all(estimate.n_inliers == 0 and estimate.reason for estimate in found[1:-1])
     for estimate, items in zip(found[-4:-1], ("4 items", "NoneType", "int"), strict=True):
@@ -229,18 +231,22 @@ def test_a_dask_cluster_takes_it_unchanged(pairs):
 
 
 @pytest.mark.filterwarnings("default")
-def test_dask_gives_up_on_a_pair_and_the_rest_goes_on(pairs):
+@pytest.mark.parametrize(
+    ("make", "reason"), [(Deadly, "worker process died"), (cv2.UMat, "cannot be pickled")]
+)
+def test_a_pair_that_dask_gives_up_or_cannot_send_fails_alone(pairs, make, reason):
     distributed = pytest.importorskip("distributed")
     dask = pytest.importorskip("dask")
-    mixed = [pairs[0], (Deadly(), pairs[1][1]), *pairs[2:]]
+    mixed = [pairs[0], (make(), pairs[1][1]), *pairs[2:]]
     with dask.config.set({"distributed.scheduler.allowed-failures": 0}):
+        # To joblib the one worker is one job, which need not leave this process.
         cluster = distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, dashboard_address=None, silence_logs=50
+            n_workers=1, threads_per_worker=1, dashboard_address=None, silence_logs=50
         )
         with cluster, distributed.Client(cluster), joblib.parallel_config(backend="dask"):
             found = list(estimate_many(mixed))
     assert [bool(estimate) for estimate in found] == [True, False, *[True] * len(pairs[2:])]
-    assert "worker process died" in found[1].reason
+    assert reason in found[1].reason
     assert same(found[-1], estimate_fundamental(*pairs[-1]))
 
 

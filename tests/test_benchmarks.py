@@ -337,7 +337,7 @@ class TestReport:
 
     def test_words_stand_left_and_figures_right(self):
         body = [["a", "1.5 [1 to 2]", "motorcycle", ""], ["b", "lost [2 to lost]", "7-point", "3"]]
-        table = report._table(["method", "error", "pair", "n"], body)
+        table = report.table(["method", "error", "pair", "n"], body)
         assert table.splitlines()[1] == "| --- | --: | --- | --: |"
 
     def test_a_page_is_filled_with_the_tables_it_names(self, tmp_path):
@@ -394,6 +394,21 @@ class TestReport:
         assert "## SIFT ratio < 0.9, threshold 1 px" in printed
         assert main([*arguments, "cv2:USAC_MAXSAC"]) == 2
         assert "no method 'cv2:USAC_MAXSAC'" in capsys.readouterr().err
+
+    def test_no_pairs_no_report(self, tmp_path, exact, capsys):
+        pair = {"pts1": exact.X[:, :2], "pts2": exact.X[:, 2:], "size1": [9, 8], "size2": [9, 8]}
+        np.savez(tmp_path / "a.npz", **pair, score_kind="none", F_gt=exact.F_gt)
+        arguments = ["real", "--data", str(tmp_path), "--methods", "cv2:FM_RANSAC", "--cut", ".8"]
+        assert main(arguments) == 2
+        assert "--cut takes pairs with SIFT ratios only" in capsys.readouterr().err
+        assert main([*arguments, "all"]) == 0
+        assert "1 pairs" in capsys.readouterr().out
+        assert main(["synthetic", "--repeats", "0"]) == 2
+        assert "--repeats is 1 at least" in capsys.readouterr().err
+        for wrong in ("nan", "0"):
+            with pytest.raises(SystemExit):
+                main([*arguments, wrong])
+            assert f"'{wrong}' is neither a SIFT ratio nor 'all'" in capsys.readouterr().err
 
     def test_stages_have_a_column_for_each_number(self, capsys):
         assert main(["stages", "--n", "50", "100", "--repeats", "1"]) == 0

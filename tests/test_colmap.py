@@ -213,6 +213,16 @@ def test_incoherent_inliers_do_not_verify_a_pair(database, made):
         verify_matches(database, min_coherence=np.nan)
 
 
+@pytest.mark.parametrize("method", ["lmeds", "FM_7POINT", 2])
+def test_most_being_inliers_says_nothing_where_they_always_are(database, made, method):
+    _, points1, points2 = list(made[1].values())[2]  # the junk
+    assert estimate_fundamental(points1, points2, method=method).mask.mean() > 0.5
+    verify_matches(database, method=method)
+    assert rows(database)[2][4] == DEGENERATE
+    assert verify_matches(database, method=method, min_coherence=1.0).n_verified == 0
+    assert verify_matches(database, method=method, min_coherence=-1.0).n_verified == 4
+
+
 def refused(path, capsys, *options):
     """The one line, and the file as it was."""
     before = folder_of(path)
@@ -308,7 +318,7 @@ def test_refuses_entries_that_make_no_sense(database, capsys, change, complaint)
 
 
 def test_wrong_options(database, capsys):
-    for options in (["--min-inliers", "7"], ["--threshold", "0"], ["--jobs", "-3"]):
+    for options in (["--min-inliers", "7"], ["--threshold", "0"], ["--jobs", "0"]):
         with pytest.raises(SystemExit) as stopped:
             main(["verify", str(database), *options])
         assert stopped.value.code == 2
@@ -317,6 +327,8 @@ def test_wrong_options(database, capsys):
     before = rows(database)
     with pytest.raises(ValueError, match="unknown method"):
         verify_matches(database, method="magic")
+    with pytest.raises(TypeError, match="a COLMAP database has no place for them"):
+        verify_matches(database, scores=np.ones(300))
     assert rows(database) == before
 
 

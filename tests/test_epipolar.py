@@ -204,9 +204,10 @@ def test_frame_sums_outer_squares_and_moments(n):
 @pytest.mark.parametrize("n", [1, 3000, 20_000])
 def test_products_are_small_enough_for_one_thread(n, multiplications):
     parts = Frame(np.random.default_rng(0).normal(size=(n, 4)))._parts(multiplications)
-    np.testing.assert_array_equal(np.concatenate([np.arange(n)[part] for part in parts]), range(n))
+    numbers = np.arange(n)
+    np.testing.assert_array_equal(np.concatenate([numbers[part] for part in parts]), numbers)
     for part in parts:
-        rows = len(np.arange(n)[part])
+        rows = len(numbers[part])
         assert rows * multiplications <= 2**18 or rows == 1
 
 

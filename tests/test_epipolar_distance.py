@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cv_densityf._zhang import epipolar_distance
+from cv_densityf._zhang import _one_way, epipolar_distance
 from cv_densityf.datasets import two_view_scene
 
 SIZE1, SIZE2 = (640, 480), (800, 500)
@@ -198,6 +198,22 @@ def test_a_line_along_the_border_is_in_the_image():
     assert 0 < epipolar_distance(top, general(0), SIZE1, SIZE2) < np.inf
 
 
+def test_a_point_that_is_the_epipole_is_drawn_again():
+    class Draws:
+        def __init__(self, *draws):
+            self.draws = iter(np.array(draws, dtype=float))
+
+        def random(self, shape):
+            return next(self.draws)
+
+    F, G = cross([100, 240, 1]), cross([320, 240, 1])
+    middle, others = [0.5, 0.5, 0.5], [[0.2, 0.3, 0.4], [0.7, 0.1, 0.6], [0.4, 0.8, 0.9]]
+    sizes = np.array(SIZE1), np.array(SIZE1)
+    expected = _one_way(F, G, *sizes, 2, Draws(others[:2]))
+    assert 0 < expected < np.inf
+    assert _one_way(F, G, *sizes, 2, Draws([others[0], middle], others[1:])) == expected
+
+
 def test_the_seed_decides_the_points():
     F0, F1 = general(0), general(1)
     first = epipolar_distance(F0, F1, SIZE1, SIZE2, random_state=1)
@@ -220,6 +236,14 @@ def test_says_what_is_wrong():
         epipolar_distance(ROWS, ROWS, (640, 480, 3), SIZE2)
     with pytest.raises(ValueError, match="n is 0"):
         epipolar_distance(ROWS, ROWS, SIZE1, SIZE2, n=0)
+    with pytest.raises(ValueError, match=r"n is 10\.0; it must be an integer"):
+        epipolar_distance(ROWS, ROWS, SIZE1, SIZE2, n=10.0)
+
+
+@pytest.mark.parametrize("size", ["ab", (640, (480, 1)), (640, 480j), None, {}])
+def test_sizes_that_are_no_numbers_are_named(size):
+    with pytest.raises(ValueError, match="size1"):
+        epipolar_distance(ROWS, ROWS, size, SIZE2)
 
 
 def test_complex_matrices_are_refused():

@@ -4,11 +4,13 @@ import io
 import itertools
 import os
 import pickle
+import re
 import struct
 import tracemalloc
 import zipfile
 
 import numpy as np
+import pandas
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -387,6 +389,13 @@ class TestReplacing:
             temporary.write_text("new")
         assert (tmp_path / "out.json").stat().st_mode == (tmp_path / "usual").stat().st_mode
 
+    def test_rights_of_the_file_before_stay(self, tmp_path):
+        path = tmp_path / "out.json"
+        path.touch(0o600)
+        with replacing(path) as temporary:
+            temporary.write_text("new")
+        assert path.stat().st_mode & 0o777 == 0o600
+
     def test_a_link_stays_one(self, tmp_path):
         (tmp_path / "elsewhere").mkdir()
         link = tmp_path / "out.json"
@@ -403,6 +412,21 @@ class TestReplacing:
             replacing(path) as temporary,
         ):
             temporary.write_text("new")
+
+
+@pytest.mark.parametrize("n_columns", [4, 5])
+def test_numbers_of_columns_that_pandas_wrote_are_no_match(tmp_path, n_columns):
+    path = tmp_path / "m.csv"
+    table = pandas.DataFrame(np.hstack([X, X])[:, :n_columns])
+    table.to_csv(path, index=False)
+    with pytest.raises(InputError, match=r"line 1: 0,1,2,3.* is a header as pandas") as refusal:
+        read_matches(path)
+    header = re.search(r"put (\S+) in its place", str(refusal.value))[1]
+    table.to_csv(path, index=False, header=header.split(","))
+    np.testing.assert_array_equal(read_matches(path)[0], X)
+    counted = ",".join("01234"[:n_columns])
+    path.write_text(f"{header}\n{counted}\n")
+    np.testing.assert_array_equal(read_matches(path)[0], [[0, 1, 2, 3]])
 
 
 @pytest.mark.parametrize(

@@ -171,6 +171,14 @@ class TestKindsOfImages:
         assert matches.X.shape == (0, 4)
         assert matches.scores.shape == (0,)
 
+    def test_a_few_bright_pixels_in_the_dark_are_seen(self):
+        image = np.zeros((200, 200), dtype=np.uint8)
+        image[90:93, 60:64] = 255  # fewer than one in a thousand
+        dark = image.astype(np.uint16) * 50
+        expected, found = detect(image), detect(dark)
+        assert len(expected.points) > 0
+        np.testing.assert_array_equal(found.points, expected.points)
+
     @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
     def test_no_number_to_see(self, value):
         assert len(detect(np.full((50, 60), value)).points) == 0
@@ -271,7 +279,17 @@ class TestReadImage:
         path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
         np.testing.assert_array_equal(read_image(path), image[:, :, :3])
 
-    @pytest.mark.parametrize("content", [b"", b"hello", b"\x89PNG\r\n\x1a\n"])
+    @pytest.mark.parametrize("share", [0.3, 0.98, 1])
+    def test_a_jpeg_file_without_its_end_is_read_as_far_as_it_goes(self, tmp_path, pair, share):
+        content = cv2.imencode(".jpg", pair.image1)[1].tobytes()
+        path = tmp_path / "image.jpg"
+        path.write_bytes(content[: int(share * len(content))])
+        found = read_image(path)
+        np.testing.assert_array_equal(found, cv2.imread(str(path)))
+        rows = int(0.7 * share * len(found))
+        assert np.abs(found[:rows] - pair.image1[:rows].astype(float)).mean() < 5
+
+    @pytest.mark.parametrize("content", [b"", b"hello", b"\x89PNG\r\n\x1a\n", b"\xff\xd8"])
     def test_not_an_image(self, tmp_path, content, capfd):
         path = tmp_path / "image.png"
         path.write_bytes(content)

@@ -63,7 +63,7 @@ WORLD = """
         import atexit, pickle, threading, helper
         print(sys.argv, sys.path, helper.__file__)
         print(__file__, __package__, __cached__, type(__loader__), getattr(__spec__, "name", None))
-        print(sorted(set(globals()) - {"__annotations__"}), __builtins__)
+        print(sorted(globals()), __builtins__)
         assert sys.modules["__main__"].__dict__ is globals()
         assert type(pickle.loads(pickle.dumps(Pickled()))) is Pickled
         assert annotated.__annotations__ == {"x": int}

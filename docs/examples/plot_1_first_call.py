@@ -76,6 +76,7 @@ estimate = cv_densityf.estimate_fundamental(points1, points2)
 print(estimate.reason)
 
 fig, ax = plt.subplots(figsize=(12, 4.6), layout="constrained")
-plot_matches(pair.image1, pair.image2, matches.X, estimate.kept, estimate.mask, ax=ax)
+classes = {"kept": estimate.kept, "mask": estimate.mask, "reliability": estimate.reliability}
+plot_matches(pair.image1, pair.image2, matches.X, **classes, ax=ax)
 plt.show()
 # sphinx_gallery_thumbnail_number = 2

@@ -48,7 +48,6 @@ matches = match_images(pair.image1, pair.image2)
 lines = cv2.computeCorrespondEpilines(matches.points1, 1, pair.F)[:, 0]
 distance = np.abs((lines * np.c_[matches.points2, np.ones(len(matches))]).sum(axis=1))
 
-fig, ax = plt.subplots(figsize=(10, 5.2))
+fig, ax = plt.subplots(figsize=(10, 5.2), layout="constrained")
 plot_decision_graph(density_peaks(matches.X), alpha=0.011, mask=distance < 1, ax=ax)
-ax.legend(loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3, frameon=False)
 plt.show()
