@@ -45,10 +45,12 @@ ROUNDS = (
 #: After so many it may be hopeless.
 _ROUNDS_BY_CHANCE = 2
 _NEAR_WIDTH = 8.0
-#: What the draws agree on may be one of several motions: with more than this share of the reliable
-#: half unexplained, one more draw is from all that is unexplained, before they may end. A motion
-#: that is the larger one has most of these, so that this draw is short.
-_UNEXPLAINED = 0.25
+#: What the draws agree on may be one of several motions, or a mark that both images bear: with more
+#: than this share of the reliable half unexplained, farther than so many working thresholds, one
+#: more draw is from all that is unexplained, before they may end. A motion that is the larger one
+#: has most of these, so that this draw is short.
+_UNEXPLAINED = 0.1
+_EXPLAINED_WIDTH = 3.0
 _SHORT_DRAW_ITERS = 200
 #: Matches a draw gets at least: fewer crowd on too little of the image to fix F.
 MIN_DRAW = 30
@@ -119,9 +121,10 @@ _STRIDE_SIGMAS = 1.4
 #: Noise may exceed the threshold; residuals beyond this many of it are wrong matches.
 _WIDEST = 3.0
 #: A working threshold of this many robust standard deviations of the residuals lets nearly every
-#: inlier vote; it never exceeds the threshold and never falls below a part of it.
+#: inlier vote; it never exceeds the threshold and never falls below a part of it: exact matches,
+#: such as those of a mark on both images, should not deny the others their vote.
 _SIGMAS = 4.0
-_SMALLEST_SCALE = 0.25
+_SMALLEST_SCALE = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,7 +289,7 @@ def _fill(
         agreed = pool.agrees()
         if agreed and not asked_rest:
             asked_rest = True
-            rest = ~pool.near_best(_NEAR_WIDTH)[order]
+            rest = ~pool.near_best(_EXPLAINED_WIDTH)[order]
             much = rest[: len(order) // 2].mean() > _UNEXPLAINED
             if much and np.count_nonzero(rest) >= MIN_DRAW:
                 short = _Part(points[rest], min(max_iters, _SHORT_DRAW_ITERS), 0)

@@ -41,8 +41,10 @@ MAX_REFINED = 100_000
 MAX_RANKED = 1_000
 #: The noise is the data's, and the caller's threshold rules the mask: the search has this part of
 #: the points' spread for its threshold, 1 to 3 px in a photograph, as far as it is within this
-#: factor of the caller's; below half of it, right matches may not agree any more.
+#: factor of the caller's; below half of it, right matches may not agree any more. Few matches get
+#: more, by this over their number: of these each that is right counts.
 _SEARCH_THRESHOLD = 0.01
+_MORE_FOR_FEW = 0.25
 _LEEWAY = 2.0
 #: Matches of a minimal sample: fewer have no F, and an F that explains fewer is none.
 MINIMAL = 7
@@ -182,7 +184,7 @@ def _estimate(
     if trust is None and robust.best_first:
         trust = -rows.astype(np.float64)
     asked: dict[str, Any] = {
-        "threshold": _search_threshold(about[1], robust, density),
+        "threshold": _search_threshold(about[1], len(Z), robust, density),
         "confidence": robust.confidence,
         "max_iters": robust.max_iters,
         "seed": seed,
@@ -239,8 +241,8 @@ def _estimate(
     )
 
 
-def _search_threshold(spread: float, robust: Robust, density: str) -> float:
-    own = _SEARCH_THRESHOLD * spread
+def _search_threshold(spread: float, n: int, robust: Robust, density: str) -> float:
+    own = (_SEARCH_THRESHOLD + _MORE_FOR_FEW / n) * spread
     if robust.rule == "lmeds":  # takes none from the caller
         return own
     if density == "paper":  # th of its step 5
@@ -375,8 +377,8 @@ def estimate_fundamental(
     threshold : float
         Largest residual of an inlier, pixels, in (1e-12, 1e6); unused by ``"lmeds"``, which finds
         its own. It rules the mask: the search has one of its own, a hundredth of the points'
-        spread, brought to within a factor of two of this one, but never below half of that
-        hundredth; ``density="paper"`` takes this one.
+        spread, brought to within a factor of two of this one, but never below half of its
+        own; ``density="paper"`` takes this one.
     confidence : float
         Of each draw to have found the best model, in (0, 1).
     max_iters : int

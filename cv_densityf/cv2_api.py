@@ -208,7 +208,7 @@ def findFundamentalMat(
     On the default path the threshold, the confidence and the seed of ``params`` count, its sampler
     only as far as PROSAC's means that the rows come best first. The threshold rules the mask; the
     search has one of its own, a hundredth of the points' spread, brought to within a factor of two
-    of it, but never below half of that hundredth. There are up to sixteen draws, twice as many for
+    of it, but never below half of its own. There are up to sixteen draws, twice as many for
     more than 1,000 matches, and each ends after at most ``maxIters`` and a thousand samples.
     ``density="paper"`` draws at the threshold given, and up to ``maxIters`` samples.
 

@@ -859,9 +859,14 @@ def test_the_search_gets_confidence_and_iterations(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("threshold", "searched"), [(0.1, 1.5), (1.0, 2.0), (4.0, 3.0), (10.0, 5.0)]
+    ("threshold", "searched", "of_25"), [(0.1, 1.5, 3), (1.0, 2.0, 3), (4, 3, 6), (10, 5, 6)]
 )
-def test_the_searchs_threshold_is_a_hundredth_of_the_spread_near_the_callers(threshold, searched):
+def test_the_searchs_threshold_is_a_hundredth_of_the_spread_near_the_callers(
+    threshold, searched, of_25
+):
+    """Of few matches more."""
     robust = Robust(cv2.USAC_DEFAULT, threshold, 0.99, 1000)
-    assert _estimate._search_threshold(300.0, robust, "contrast") == searched
-    assert _estimate._search_threshold(300.0, robust, "paper") == threshold
+    for n, expected in ((10**9, searched), (25, of_25)):
+        found = _estimate._search_threshold(300.0, n, robust, "contrast")
+        assert found == pytest.approx(expected)
+        assert _estimate._search_threshold(300.0, n, robust, "paper") == threshold

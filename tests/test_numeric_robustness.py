@@ -214,6 +214,22 @@ def test_the_images_may_be_in_different_units(plain, way, method, side, factor):
 
 @pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("method", ["usac_magsac", *RULES])
+def test_a_mark_on_both_images_changes_little(plain, way, method):
+    """Exact and dense, it has a smaller noise than what is right, which is twice as much."""
+    errors = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        scene = two_view_scene(360, inlier_ratio=0.75, noise=0.5, random_state=seed)
+        corner = rng.choice([[50, 30], [900, 30], [50, 800], [900, 800]], 140)
+        mark = corner + rng.uniform(0, [150, 30], (140, 2))
+        X = rng.permutation(np.vstack([scene.X, np.hstack([mark, mark])]))
+        errors.append(error_of(WAYS[way](X, method, 1.0), seed))
+    assert max(errors) < 5
+    assert np.median(errors) < 2.0 * np.median(plain[way, method]) + 0.02
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("method", ["usac_magsac", *RULES])
 @pytest.mark.parametrize("side", SIDES[:2])
 def test_tracks_that_end_in_one_point_change_little(plain, way, method, side):
     """An F whose epipole is there suits all of them, twice as many as there are right ones."""
