@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 import cv_densityf
 from cv_densityf._arguments import DENSITIES, THRESHOLDS, DensityRule
-from cv_densityf._engine import METHODS, Robust, method_flag, short_name
+from cv_densityf._engine import METHODS, Robust, has_threshold, method_flag, short_name
 from cv_densityf._epipolar import Floats, residuals
 from cv_densityf._estimate import (
     MIN_FILTERED,
@@ -542,13 +542,13 @@ def _median_residual(F: Floats | None, X: Floats, robust: Robust) -> float | Non
 
 
 def _for_people(report: dict[str, Any], robust: Robust) -> str:
-    finds_its_own = robust.rule == "lmeds"
+    by_threshold = has_threshold(robust.flag)
     times = report["timings_ms"]
     kept, ranked, n = (report[name] for name in ("n_kept", "n_ranked", "n_matches"))
     kept = kept if ranked == n else f"{kept} of {ranked}"
     ours = [kept, *_result(report), f"{times['estimating']:.1f}"]
     names = ["kept as dense", "inliers", "coherence", "median residual, px", "processor time, ms"]
-    threshold = "" if finds_its_own else f", threshold {report['threshold']:g} px"
+    threshold = f", threshold {report['threshold']:g} px" if by_threshold else ""
     scored = " with scores" if report["scores"] else ""
     lines = [f"{n} matches{scored}, {report['method']}{threshold}", ""]
     if report["cv2"] is not None and "plain cv2" not in times:
@@ -572,7 +572,9 @@ def _for_people(report: dict[str, Any], robust: Robust) -> str:
     coherence, n_inliers = report["coherence"], report["n_inliers"]
     if report["F"] is not None and n_inliers <= MINIMAL + 1:
         lines += ["", f"Some F fits any {MINIMAL} matches: so few inliers say nothing."]
-    elif coherence is not None and coherence < COHERENT and (finds_its_own or 2 * n_inliers <= n):
+    elif (
+        coherence is not None and coherence < COHERENT and not (by_threshold and 2 * n_inliers > n)
+    ):
         lines += ["", "Images that have nothing in common have inliers of such coherence."]
     if report["F"] is not None:
         rows_of_F = ["  " + "".join(f"{value:>18.9e}" for value in row) for row in report["F"]]
@@ -631,13 +633,14 @@ def _draw(
 ) -> None:
     from cv_densityf import plotting
     from cv_densityf._density import density_peaks
+    from cv_densityf._paper import relative_gamma
 
     rows = np.flatnonzero(finite_in_cv2(X))
     n_finite = len(rows)
     step = max(1, -(-len(rows) // _MAX_GRAPH_POINTS))
     rows = rows[::step]
     peaks = density_peaks(X[rows])
-    share = peaks.gamma / (peaks.rho.max() * peaks.delta.max() or 1.0)
+    by_rule = np.allclose(estimate.reliability[rows], relative_gamma(peaks))
     figure = plotting.summary_figure(
         *images,
         X[rows],
@@ -647,7 +650,7 @@ def _draw(
         reliability=estimate.reliability[rows],
         peaks=peaks,
         # Where the rule looked at others than these, its curve does not part them.
-        alpha=alpha if np.allclose(estimate.reliability[rows], share) else None,
+        alpha=alpha if by_rule else None,
     )
     if step > 1:
         figure.suptitle(f"1 in {step} of {n_finite} matches shown", fontsize=13)

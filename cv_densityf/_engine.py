@@ -79,6 +79,11 @@ def is_usac(flag: int) -> bool:
     return flag in _USAC_FLAGS
 
 
+def has_threshold(flag: int) -> bool:
+    """Whether the caller's threshold tells inliers; to other methods most matches always are."""
+    return is_usac(flag) or flag == cv2.FM_RANSAC
+
+
 def cuts_graph(flag: int, params: cv2.UsacParams | None) -> bool:
     """Whether cv2 optimises locally by graph cut."""
     if params is not None:

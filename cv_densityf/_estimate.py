@@ -377,8 +377,8 @@ def estimate_fundamental(
     threshold : float
         Largest residual of an inlier, pixels, in (1e-12, 1e6); unused by ``"lmeds"``, which finds
         its own. It rules the mask: the search has one of its own, a hundredth of the points'
-        spread, brought to within a factor of two of this one, but never below half of its
-        own; ``density="paper"`` takes this one.
+        spread and, of n matches, a quarter of an n-th, brought to within a factor of two of this
+        one, but never below half of its own; ``density="paper"`` takes this one.
     confidence : float
         Of each draw to have found the best model, in (0, 1).
     max_iters : int

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cv_densityf._consensus import Consensus
-from cv_densityf._density import density_peaks
+from cv_densityf._density import DensityPeaksResult, density_peaks
 from cv_densityf._epipolar import eight_point, point_line_squared
 
 Floats = NDArray[np.floating]
@@ -24,10 +24,14 @@ def paper_support(
     The rule of Wu and Wan, section 2.6: a match whose rho * delta is lower than
     alpha * rho_max * delta_max is an outlier.
     """
-    peaks = density_peaks(X, dc_percent=dc_percent)
-    scale = float(peaks.rho.max() * peaks.delta.max())
-    reliability = peaks.gamma / scale if scale > 0 else np.ones(len(X))
+    reliability = relative_gamma(density_peaks(X, dc_percent=dc_percent))
     return reliability, reliability >= alpha
+
+
+def relative_gamma(peaks: DensityPeaksResult) -> NDArray[np.float64]:
+    """Return gamma / (rho_max * delta_max), all ones where that is 0, (n,)."""
+    scale = float(peaks.rho.max() * peaks.delta.max())
+    return peaks.gamma / scale if scale > 0 else np.ones(len(peaks.gamma))
 
 
 def eight_point_ransac(

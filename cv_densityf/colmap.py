@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from cv_densityf._arguments import check
 from cv_densityf._coherence import coherence
-from cv_densityf._engine import METHODS, method_flag
+from cv_densityf._engine import has_threshold, method_flag
 from cv_densityf._estimate import Estimate
 from cv_densityf._files import InputError
 from cv_densityf._prefilter import COHERENT
@@ -39,8 +39,6 @@ _CHUNK = 256
 _CACHED_IMAGES = 512
 #: What comes of a pair.
 _VERIFIED, _FEW, _INCOHERENT = "verified", "few inliers", "incoherent"
-#: To these at least half of the matches are inliers, whatever they are.
-_WITHOUT_THRESHOLD = {METHODS[name] for name in ("7point", "8point", "lmeds")}
 #: Seconds to wait for another program's lock.
 _PATIENCE = 5.0
 
@@ -159,7 +157,7 @@ def verify_matches(
         n_pairs = _check(connection)
         # Checks the options, also where there is nothing left to do.
         estimate_many((), **asked)
-        most_will_do = method_flag(method) not in _WITHOUT_THRESHOLD
+        most_will_do = has_threshold(method_flag(method))
         where = "WHERE pair_id NOT IN (SELECT pair_id FROM two_view_geometries)" if resume else ""
         todo = [
             pair_id
