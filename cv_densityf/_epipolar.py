@@ -108,6 +108,8 @@ _MOMENT_ROWS, _MOMENTS = np.unique(
     np.stack([_SQUARE[6:, 6:], _SQUARE[2::3, 2::3]]), return_inverse=True
 )
 _MOMENTS = _MOMENTS.reshape(2, 3, 3)
+#: Adds up what belongs to the same of these rows, (18, 11).
+_GATHERED = np.equal.outer(_MOMENTS.ravel(), np.arange(len(_MOMENT_ROWS))).astype(np.float64)
 #: OpenBLAS starts threads for products of more multiplications. They save microseconds, and cost
 #: milliseconds where the cores are busy; and the sums would depend on their number.
 _ONE_THREAD = 2**18
@@ -154,7 +156,7 @@ class Frame:
     def enter(self, F: Floats) -> Floats:
         """Fundamental matrices (m, 3, 3) in pixels, in this frame and of unit norm."""
         G = self._from_second.T @ F @ self._from_first
-        return np.asarray(G / np.sqrt(np.einsum("mij,mij->m", G, G))[:, None, None])
+        return np.asarray(G / _norms(G))
 
     def leave(self, G: Floats) -> Floats:
         """Fundamental matrices (m, 3, 3) of this frame, in pixels."""
@@ -162,16 +164,11 @@ class Frame:
 
     def errors(self, G: Floats) -> tuple[Floats, Floats]:
         """Algebraic error and squared gradient norm of each match under each matrix, (m, n)."""
-        m = len(G)
-        algebraic, norm = np.empty((2, m, self.products.shape[1]))
-        rows, columns = G[:, :2].reshape(-1, 3), G[:, :, :2].transpose(0, 2, 1).reshape(-1, 3)
-        for part in self._parts(9 * m):
-            lines2 = (rows @ self.homogeneous1[:, part]).reshape(m, 2, -1)
-            lines1 = (columns @ self.homogeneous2[:, part]).reshape(m, 2, -1)
-            np.einsum("mkn,mkn->mn", lines2, lines2, out=norm[:, part])
-            norm[:, part] += np.einsum("mkn,mkn->mn", lines1, lines1)
-            np.matmul(G.reshape(-1, 9), self.products[:, part], out=algebraic[:, part])
-        return algebraic, norm
+        rows, columns = G[:, :2], G[:, :, :2]
+        # The norm is a quadratic form of the points of either image.
+        forms = np.stack([rows.transpose(0, 2, 1) @ rows, columns @ columns.transpose(0, 2, 1)], 1)
+        norm = self._combined(forms.reshape(-1, 18) @ _GATHERED, self._squares)
+        return self._combined(G.reshape(-1, 9), self.products), np.maximum(norm, _EPSILON)
 
     def gram(self, weights: Floats) -> Floats:
         """Weighted sums (m, 9, 9) of the outer squares of `products`, for weights (m, n)."""
@@ -188,6 +185,13 @@ class Frame:
             total += weights[:, part] @ rows[:, part].T
         return total
 
+    def _combined(self, factors: Floats, rows: Floats) -> Floats:
+        """Sum up ``rows`` (r, n) with ``factors`` (m, r), (m, n)."""
+        total = np.empty((len(factors), rows.shape[1]))
+        for part in self._parts(factors.size):
+            np.matmul(factors, rows[:, part], out=total[:, part])
+        return total
+
     def _parts(self, multiplications: int) -> list[slice]:
         """Cut the matches, of so many multiplications each, to what one thread of BLAS does."""
         n = self.products.shape[1]
@@ -197,7 +201,7 @@ class Frame:
     def sampson(self, G: Floats) -> Floats:
         """Squared Sampson distances in squared pixels, (m, n)."""
         algebraic, norm = self.errors(G)
-        return algebraic * algebraic / (norm * self.scale**2 + _TINY)
+        return algebraic * algebraic / (norm * self.scale**2)
 
 
 def middle(X: Floats) -> tuple[Floats, float]:
@@ -220,9 +224,14 @@ def shift(by: Floats) -> NDArray[np.float64]:
 
 
 _TINY = 1e-300
+#: Of a sum of terms of size 1, what rounding may have left.
+_EPSILON = 1e-15
 #: Matches this many times as far out as three quarters of them cannot be in the image.
 FAR = 5.0
-_EYE = np.eye(7)
+#: How stiff a direction is in which a step should not go, and how stiff all are at least, in units
+#: of the Hessian's trace.
+_STIFFNESS = 1e2
+_DAMPING = 1e-9 * np.eye(9)
 #: D, which leaves of a line's three coefficients the two that make its normal.
 _NORMAL = np.diag([1.0, 1.0, 0.0])
 #: How far the essential ratio of a right matrix may well fall short of 1, and from where on this
@@ -232,8 +241,9 @@ _FOREIGN = 0.03
 #: Degrees of freedom of Student's distribution of right residuals, whose density is then as
 #: (1 + z^2 / 5)^-3.
 _DEGREES = 5.0
-#: By which slopes are taken, of a matrix of unit norm.
+#: By which slopes are taken, of a matrix of unit norm: none, each entry more, each entry less.
 _NUDGE = 1e-4
+_NUDGES = _NUDGE * np.concatenate([np.zeros((1, 9)), np.eye(9), -np.eye(9)]).reshape(19, 3, 3)
 #: Of a matrix's entries, row by row, those whose products make its cofactors: the first ones times
 #: the second less the third times the fourth.
 _NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
@@ -271,11 +281,10 @@ def essential_ratio(F: Floats, image_size: float = np.sqrt(12.0)) -> NDArray[np.
         Pixels. The default is that of points spread evenly, in a `Frame`.
     """
     zoom = np.array([image_size, image_size, 1.0])
-    entries = (F * np.outer(zoom, zoom)).reshape(-1, 9)
-    factors = entries.take(_MINORS, axis=1)
-    cofactors = factors[:, 0] * factors[:, 1] - factors[:, 2] * factors[:, 3]
+    entries = F * np.outer(zoom, zoom)
+    cofactors = _cofactors(entries).reshape(-1, 9)
     # Of K'^T F K: the sum of the squares of the singular values s >= t, and that of the product.
-    total = entries**2 @ _ENTRY_GAIN
+    total = entries.reshape(-1, 9) ** 2 @ _ENTRY_GAIN
     squared = cofactors**2 @ _COFACTOR_GAIN
     # The largest square of 2 s t / (s^2 + t^2), which grows with t / s and tells it.
     largest = np.minimum(4.0 * (squared / (total * total)).max(axis=1), 1.0)
@@ -343,7 +352,7 @@ def polish(
     Returns
     -------
     array, shape (m, 3, 3), or (k, 3, 3)
-        Matrices of rank 2 and unit norm, in the frame.
+        Matrices of unit norm in the frame, of rank 2 but for what a long last step has left.
     """
     for scale in scales:
         at = _Linearized(frame, G)
@@ -352,7 +361,7 @@ def polish(
         if samples is not None:
             weight, samples = weight * samples, None
         G = at.moved(*at.normal_equations(weight))
-    return _rank_two(G)[0]
+    return _towards_rank_two(G)[0]
 
 
 def refine(
@@ -394,9 +403,8 @@ def refine(
         # The density of right ones is as near ** 3.
         density = near * near * near
         hessian, gradient = at.normal_equations(near * density / (density + doubt))
-        nudge = _NUDGE * at.tangent.reshape(7, 3, 3)
-        lack = 1.0 - essential_ratio(at.G + np.concatenate([0.0 * nudge[:1], nudge, -nudge]))
-        slope = (lack[1:8] - lack[8:]) / (2.0 * _NUDGE)
+        lack = 1.0 - essential_ratio(at.G + _NUDGES)
+        slope = (lack[1:10] - lack[10:]) / (2.0 * _NUDGE)
         pull = np.square(noise * frame.scale / _SHORTFALL) / (1.0 + (lack[0] / _FOREIGN) ** 2)
         hessian += pull * slope[:, None] * slope
         gradient += (pull * lack[0] * slope)[:, None]
@@ -407,56 +415,70 @@ def refine(
 class _Linearized:
     """Residuals at matrices of rank 2, and how they change with these: a Gauss-Newton step.
 
-    A step goes along the tangent space at ``U diag(s_1, s_2, 0) V^T``, and ends at the nearest
-    matrix of rank 2 (Absil, Mahony and Sepulchre, "Optimization algorithms on matrix manifolds",
-    2008). The gradient is exact: to hold the denominator of the Sampson distance fixed, as
-    iteratively reweighted least squares do, would end beside the minimum, far beside it where the
-    baseline is short (Chojnacki, Brooks, van den Hengel and Gawley, "On the fitting of surfaces to
-    data with covariances", PAMI 2000).
+    The unknowns are all nine entries. The two directions in which norm and rank would change, along
+    G and its cofactors, are made stiff, so that a step goes along the tangent space of the matrices
+    of rank 2 (Absil, Mahony and Sepulchre, "Optimization algorithms on matrix manifolds", 2008).
+    The gradient is exact: to hold the denominator of the Sampson distance fixed, as iteratively
+    reweighted least squares do, would end beside the minimum, far beside it where the baseline is
+    short (Chojnacki, Brooks, van den Hengel and Gawley, "On the fitting of surfaces to data with
+    covariances", PAMI 2000).
 
     Attributes
     ----------
     G : array, shape (m, 3, 3)
-        The nearest matrices of rank 2.
-    tangent : array, shape (m, 7, 9)
-        Directions that keep rank and norm.
+        The matrices, a step nearer to rank 2.
     squared : array, shape (m, n)
         Squared Sampson distances, in the frame.
     """
 
-    __slots__ = ("G", "_frame", "_norm", "squared", "tangent")
+    __slots__ = ("G", "_frame", "_norm", "_stiff", "squared")
 
     def __init__(self, frame: Frame, G: Floats) -> None:
-        self.G, U, S, Vt = _rank_two(G)
-        # The directions u_i v_j^T in which the rank stays two, so not the last, u_3 v_3^T; in place
-        # of u_1 v_1^T and u_2 v_2^T, rows 0 and 4, the one of both that keeps the norm.
-        outer = U.transpose(0, 2, 1)[:, :, None, :, None] * Vt[:, None, :, None]
-        outer = outer.reshape(-1, 9, 9)
-        outer[:, 4] = S[:, :1] * outer[:, 4] - S[:, 1:2] * outer[:, 0]
-        self.tangent = outer[:, 1:8]
+        self.G, across = _towards_rank_two(G)
+        self._stiff = np.stack([self.G, across], axis=1).reshape(-1, 2, 9)
         algebraic, self._norm = frame.errors(self.G)
-        self._norm += _TINY
         self.squared = algebraic * algebraic / self._norm
         self._frame = frame
 
     def normal_equations(self, weight: Floats) -> tuple[Floats, Floats]:
-        """Hessian (m, 7, 7) and gradient (m, 7, 1) of least squares with weights (m, n)."""
-        m = len(weight)
+        """Hessian (m, 9, 9) and gradient (m, 9, 1) of least squares with weights (m, n)."""
         weight = weight / self._norm
-        half = self.tangent @ self._frame.gram(weight)
-        gradient = half @ self.G.reshape(-1, 9, 1)
+        hessian = self._frame.gram(weight)
         # The denominator's part, half the derivative of x^T G^T D G x + x'^T G D G^T x'.
         moments = self._frame.moments(weight * self.squared)
         drift = _NORMAL @ self.G @ moments[:, 0] + moments[:, 1] @ self.G @ _NORMAL
-        gradient -= self.tangent @ drift.reshape(m, 9, 1)
-        return half @ self.tangent.transpose(0, 2, 1), gradient
+        return hessian, hessian @ self.G.reshape(-1, 9, 1) - drift.reshape(-1, 9, 1)
 
     def moved(self, hessian: Floats, gradient: Floats) -> Floats:
-        """Matrices (m, 3, 3) a step further, of rank 2 but for the second order."""
-        damping = 1e-9 * np.einsum("mkk->m", hessian) + _TINY
-        step = -np.linalg.solve(hessian + damping[:, None, None] * _EYE, gradient)
-        step *= np.minimum(1.0, 0.5 / (np.sqrt((step * step).sum(axis=1, keepdims=True)) + _TINY))
-        return np.asarray(self.G + (step.transpose(0, 2, 1) @ self.tangent).reshape(-1, 3, 3))
+        """Matrices (m, 3, 3) a step further, of rank 2 and unit norm but for the second order."""
+        trace = np.einsum("mkk->m", hessian)[:, None, None] + _TINY
+        stiff = (_STIFFNESS * self._stiff.transpose(0, 2, 1)) @ self._stiff + _DAMPING
+        step = np.linalg.solve(hessian + trace * stiff, gradient).reshape(-1, 3, 3)
+        return np.asarray(self.G - step * np.minimum(1.0, 0.5 / (_norms(step) + _TINY)))
+
+
+def _towards_rank_two(G: Floats) -> tuple[Floats, Floats]:
+    """Step from matrices (m, 3, 3) near rank 2 towards it: one of Newton's, to a determinant of 0.
+
+    Returns them, of unit norm, and the directions in which their determinants change.
+    """
+    across = _cofactors(G)
+    across /= _norms(across) + _TINY
+    # Three times the determinant is the sum of the entries times their cofactors.
+    G = G - np.einsum("mij,mij->m", across, G)[:, None, None] / 3.0 * across
+    G /= _norms(G)
+    return G, across
+
+
+def _norms(G: Floats) -> Floats:
+    """Frobenius norms of matrices (m, 3, 3), (m, 1, 1)."""
+    return np.asarray(np.sqrt(np.einsum("mij,mij->m", G, G))[:, None, None])
+
+
+def _cofactors(G: Floats) -> Floats:
+    """Cofactors of matrices (m, 3, 3), the determinant's gradient; of the same shape."""
+    factors = G.reshape(-1, 9).take(_MINORS, axis=1)
+    return (factors[:, 0] * factors[:, 1] - factors[:, 2] * factors[:, 3]).reshape(-1, 3, 3)
 
 
 def _rank_two(G: Floats) -> tuple[Floats, Floats, Floats, Floats]:

@@ -148,7 +148,7 @@ def test_a_distance_from_no_line_is_said_without_a_warning():
         assert np.isinf(residuals(infinitely_far, X, rule)).all()
         assert not inlier_mask(np.zeros((3, 3)), X, rule, 1e9).any()
         assert not inlier_mask(infinitely_far, X, rule, 1e9).any()
-    assert (Frame(X).sampson(infinitely_far[None]) > 1e200).all()
+    assert (Frame(X).sampson(infinitely_far[None]) > 1e15).all()
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -337,15 +337,18 @@ def test_polish_finds_the_exact_f_again(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_polished_matrices_have_rank_two_and_norm_one(seed):
+def test_polished_matrices_have_norm_one_and_soon_rank_two(seed):
     scene = noisy_scene(seed, inlier_ratio=0.5)
     frame = Frame(scene.X)
     start = np.concatenate([perturbed(frame, scene.F, s, 0.05) for s in range(8)])
-    assert (np.linalg.svd(start)[1][:, 2] > 1e-4).any()
-    for steps in (1, 4):
+    assert (np.linalg.svd(start)[1][:, 2] > 1e-3).any()
+    for steps, least in ((1, 1e-4), (2, 1e-6), (10, 1e-12)):
         G = polish(frame, start, [2.0] * steps)
         np.testing.assert_allclose(np.linalg.norm(G, axis=(1, 2)), 1)
-        assert (np.linalg.svd(G)[1][:, 2] < 1e-14).all()
+        assert (np.linalg.svd(G)[1][:, 2] < least).all()
+    refined = refine(frame, start[0], 2.0, 1e-3, 1.0, 1)
+    np.testing.assert_allclose(np.linalg.norm(refined), 1)
+    assert np.linalg.svd(refined)[1][2] < 1e-15
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -525,16 +528,22 @@ def test_polish_takes_each_matrix_alone():
 
 
 def test_the_first_step_of_polish_may_be_on_samples():
-    """As it would be if there were no other matches."""
+    """As it would be if there were no other matches; the second is on all."""
     scene = noisy_scene(0, inlier_ratio=0.5)
     frame = Frame(scene.X)
     start = perturbed(frame, scene.F, 0, 1e-3)
     rng = np.random.default_rng(0)
     samples = rng.random((4, len(scene.X))) < 0.1
-    polished = polish(frame, start, [np.inf, 2.0], samples=samples)
-    for G, sample in zip(polished, samples, strict=True):
-        alone = polish(frame, polish(frame.part(sample), start, [np.inf]), [2.0])
-        np.testing.assert_allclose(unit(G), unit(alone[0]), atol=1e-9)
+    first = polish(frame, start, [np.inf], samples=samples)
+    second = polish(frame, start, [np.inf, 2.0], samples=samples)
+    on_all = polish(frame, first, [2.0])
+    for i, sample in enumerate(samples):
+        part = frame.part(sample)
+        alone = polish(part, start, [np.inf])
+        np.testing.assert_allclose(unit(first[i]), unit(alone[0]), atol=1e-9)
+        way = np.linalg.norm(unit(on_all[i]) - unit(polish(part, alone, [2.0])[0]))
+        # In between the matrix comes nearer to rank 2 once more.
+        assert np.linalg.norm(unit(second[i]) - unit(on_all[i])) < 0.05 * way
 
 
 def test_polish_stays_where_nothing_tells_it_to_go():
@@ -553,11 +562,11 @@ def test_polish_stays_where_nothing_tells_it_to_go():
 def test_a_step_of_polish_is_never_long():
     """Six angles of rotation and one of the singular values: half a radian in all."""
     frame = Frame(noisy_scene(0, n=30, inlier_ratio=0.3).X)
-    start = np.random.default_rng(0).normal(size=(500, 3, 3))
+    start = random_rank_two(np.random.default_rng(0), 500)
     before = polish(frame, start, [])
     way = np.linalg.norm(polish(frame, start, [1e4]) - before, axis=(1, 2))
     # A rotation by a small angle on either side moves a matrix of norm 1 by no more than that.
-    assert way.max() < 0.55
+    assert way.max() < 0.5
     assert np.quantile(way, 0.5) > 0.2
 
 
