@@ -166,31 +166,31 @@ class Frame:
         """Algebraic error and squared gradient norm of each match under each matrix, (m, n)."""
         rows, columns = G[:, :2], G[:, :, :2]
         # The norm is a quadratic form of the points of either image.
-        forms = np.stack([rows.transpose(0, 2, 1) @ rows, columns @ columns.transpose(0, 2, 1)], 1)
-        norm = self._combined(forms.reshape(-1, 18) @ _GATHERED, self._squares)
-        return self._combined(G.reshape(-1, 9), self.products), np.maximum(norm, _EPSILON)
+        forms = [rows.transpose(0, 2, 1) @ rows, columns @ columns.transpose(0, 2, 1)]
+        factors = np.concatenate(forms, axis=1).reshape(-1, 18) @ _GATHERED
+        norm = self._combined(factors, self._squares)
+        return self._combined(G.reshape(-1, 9), self.products), np.maximum(norm, _EPSILON, out=norm)
 
     def gram(self, weights: Floats) -> Floats:
         """Weighted sums (m, 9, 9) of the outer squares of `products`, for weights (m, n)."""
-        return self._sums(weights, self._outer)[:, _SQUARE]
+        return self._sums(weights, self._outer).take(_SQUARE, axis=1)
 
     def moments(self, weights: Floats) -> Floats:
         """Weighted sums (m, 2, 3, 3) of x x^T of either image, for weights (m, n)."""
-        return self._sums(weights, self._squares)[:, _MOMENTS]
+        return self._sums(weights, self._squares).take(_MOMENTS, axis=1)
 
     def _sums(self, weights: Floats, rows: Floats) -> Floats:
         """Weighted sums (m, r) of ``rows`` (r, n), for weights (m, n)."""
-        total = np.zeros((len(weights), len(rows)))
-        for part in self._parts(total.size):
+        first, *others = self._parts(len(weights) * len(rows))
+        total = weights[:, first] @ rows[:, first].T
+        for part in others:
             total += weights[:, part] @ rows[:, part].T
         return total
 
     def _combined(self, factors: Floats, rows: Floats) -> Floats:
         """Sum up ``rows`` (r, n) with ``factors`` (m, r), (m, n)."""
-        total = np.empty((len(factors), rows.shape[1]))
-        for part in self._parts(factors.size):
-            np.matmul(factors, rows[:, part], out=total[:, part])
-        return total
+        products = [factors @ rows[:, part] for part in self._parts(factors.size)]
+        return products[0] if len(products) == 1 else np.concatenate(products, axis=1)
 
     def _parts(self, multiplications: int) -> list[slice]:
         """Cut the matches, of so many multiplications each, to what one thread of BLAS does."""
@@ -435,7 +435,7 @@ class _Linearized:
 
     def __init__(self, frame: Frame, G: Floats) -> None:
         self.G, across = _towards_rank_two(G)
-        self._stiff = np.stack([self.G, across], axis=1).reshape(-1, 2, 9)
+        self._stiff = np.concatenate([self.G, across], axis=1).reshape(-1, 2, 9)
         algebraic, self._norm = frame.errors(self.G)
         self.squared = algebraic * algebraic / self._norm
         self._frame = frame
@@ -451,7 +451,7 @@ class _Linearized:
 
     def moved(self, hessian: Floats, gradient: Floats) -> Floats:
         """Matrices (m, 3, 3) a step further, of rank 2 and unit norm but for the second order."""
-        trace = np.einsum("mkk->m", hessian)[:, None, None] + _TINY
+        trace = hessian.trace(axis1=1, axis2=2)[:, None, None] + _TINY
         stiff = (_STIFFNESS * self._stiff.transpose(0, 2, 1)) @ self._stiff + _DAMPING
         step = np.linalg.solve(hessian + trace * stiff, gradient).reshape(-1, 3, 3)
         return np.asarray(self.G - step * np.minimum(1.0, 0.5 / (_norms(step) + _TINY)))
@@ -465,14 +465,19 @@ def _towards_rank_two(G: Floats) -> tuple[Floats, Floats]:
     across = _cofactors(G)
     across /= _norms(across) + _TINY
     # Three times the determinant is the sum of the entries times their cofactors.
-    G = G - np.einsum("mij,mij->m", across, G)[:, None, None] / 3.0 * across
+    G = G - _dots(across, G) / 3.0 * across
     G /= _norms(G)
     return G, across
 
 
 def _norms(G: Floats) -> Floats:
     """Frobenius norms of matrices (m, 3, 3), (m, 1, 1)."""
-    return np.asarray(np.sqrt(np.einsum("mij,mij->m", G, G))[:, None, None])
+    return np.asarray(np.sqrt(_dots(G, G)))
+
+
+def _dots(G: Floats, H: Floats) -> Floats:
+    """Sum up the products of the entries of matrices (m, 3, 3), (m, 1, 1)."""
+    return np.asarray(G.reshape(-1, 1, 9) @ H.reshape(-1, 9, 1))
 
 
 def _cofactors(G: Floats) -> Floats:
