@@ -202,7 +202,7 @@ def draw(
         F, _ = original(points[:, :2], points[:, 2:], params)
     except cv2.error:
         return None
-    if F is None or not np.isfinite(F).all() or not F.any():
+    if F is None or not 0.0 < np.abs(F).max() < np.inf:  # nor is NaN
         return None
     zoom = np.array([scale, scale, 1.0])
-    return np.asarray(F * np.outer(zoom, zoom), dtype=np.float64)
+    return np.asarray(F * (zoom[:, None] * zoom), dtype=np.float64)

@@ -125,7 +125,7 @@ class Frame:
 
     __slots__ = (
         *("_first", "_from_first", "_from_second", "_outer", "_second", "_squares"),
-        *("homogeneous1", "homogeneous2", "products", "scale"),
+        *("products", "scale"),
     )
 
     def __init__(self, X: Floats, about: tuple[Floats, float] | None = None) -> None:
@@ -133,9 +133,8 @@ class Frame:
         self.scale = 1.0 / spread if spread > 0 else 1.0
         Z = (X - centre).T * self.scale
         ones = np.ones((1, len(X)))
-        self.homogeneous1 = np.concatenate([Z[:2], ones])
-        self.homogeneous2 = np.concatenate([Z[2:], ones])
-        self.products = (self.homogeneous2[:, None] * self.homogeneous1[None]).reshape(9, -1)
+        first, second = np.concatenate([Z[:2], ones]), np.concatenate([Z[2:], ones])
+        self.products = (second[:, None] * first).reshape(9, -1)
         self._outer = np.empty((45, len(X)))
         row = 0
         for i in range(9):
@@ -149,7 +148,7 @@ class Frame:
     def part(self, rows: NDArray[np.bool_]) -> Frame:
         """Return the same frame, holding only the matches marked in ``rows`` (n,)."""
         part = copy(self)
-        for name in ("_outer", "_squares", "homogeneous1", "homogeneous2", "products"):
+        for name in ("_outer", "_squares", "products"):
             setattr(part, name, getattr(self, name)[:, rows])
         return part
 

@@ -180,7 +180,8 @@ def test_distances_in_the_frame_are_pixels():
 def test_frame_is_centred_with_one_scale_for_both_images(unit):
     X = unit * np.random.default_rng(0).uniform(0, [100, 50, 4000, 3000], (50, 4))
     frame = Frame(X)
-    Z = np.vstack([frame.homogeneous1[:2], frame.homogeneous2[:2]])
+    # Where the other image's coordinate is 1.
+    Z = np.vstack([frame.products[6:8], frame.products[[2, 5]]])
     np.testing.assert_allclose(Z.mean(axis=1), 0, atol=1e-12)
     assert np.sqrt((Z**2).mean()) == pytest.approx(1)
     np.testing.assert_allclose(Z, (X - X.mean(axis=0)).T * frame.scale, atol=1e-12)
@@ -190,7 +191,7 @@ def test_frame_is_centred_with_one_scale_for_both_images(unit):
 def test_frame_sums_outer_squares_and_moments(n):
     frame = Frame(np.random.default_rng(n).uniform(0, 900, (n, 4)))
     weights = np.random.default_rng(0).uniform(size=(3, n))
-    x, y = frame.homogeneous1, frame.homogeneous2
+    x, y = frame.products[6:], frame.products[2::3]
     A = np.einsum("in,jn->ijn", y, x).reshape(9, n)
     for w, gram, (first, second) in zip(
         weights, frame.gram(weights), frame.moments(weights), strict=True
