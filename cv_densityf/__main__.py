@@ -106,6 +106,10 @@ def _say(*words: object, sep: str = " ") -> None:
         print(*words, sep=sep, flush=True)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except UnicodeEncodeError:  # such as a path of other letters than the terminal's
+        encoding = sys.stdout.encoding
+        text = sep.join(map(str, words)).encode(encoding, "backslashreplace").decode(encoding)
+        print(text, flush=True)
 
 
 class _Parser(argparse.ArgumentParser):

@@ -101,6 +101,8 @@ def _checked(scores: NDArray[np.float64], n: int) -> NDArray[np.float64]:
 
 def _read_npz(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     with path.open("rb") as stream:
+        if not stream.seekable():
+            raise InputError("a pipe; an .npz has to be a file, a .csv need not")
         if stream.read(len(MAGIC_PREFIX)) == MAGIC_PREFIX:
             raise InputError("a single array; save points1 and points2 with numpy.savez")
         with _refusing("not a NumPy .npz archive"):

@@ -236,7 +236,10 @@ def _open(path: Path, *, write: bool) -> Iterator[sqlite3.Connection]:
                 f"{path}: another program has it locked; end that one, then resume"
             ) from None
         if "readonly" in str(error):
-            raise InputError(f"{path}: cannot be written; make its folder writable too") from None
+            raise InputError(
+                f"{path}: cannot be written, as SQLite must even to read it; make its folder "
+                "writable too, or take a copy"
+            ) from None
         raise InputError(f"{path}: {error}") from None
     except sqlite3.DatabaseError as error:
         raise InputError(f"{path}: not a SQLite database, or damaged ({error})") from None

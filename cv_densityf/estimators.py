@@ -564,9 +564,9 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         Raises
         ------
         ValueError
-            If no fundamental matrix was found, if X is not a finite array of four columns and at
-            least 8 rows, if a parameter is out of range, or if the prefilter answers anything but
-            a boolean mask or +-1.
+            If no fundamental matrix was found, which leaves the estimator not fitted; if X is not
+            a finite array of four columns and at least 8 rows, if a parameter is out of range, or
+            if the prefilter answers anything but a boolean mask or +-1.
 
         Warns
         -----
@@ -574,6 +574,9 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
             If the prefilter drops rows and leaves fewer than 15, or no fundamental matrix is found
             from those it leaves; all rows are used then.
         """
+        # Pairs without F are ordinary: what the last one left must not pass for theirs.
+        for name in [name for name in vars(self) if name.endswith("_")]:
+            delattr(self, name)
         self._validate_params()
         if isinstance(self.prefilter, type):
             name = self.prefilter.__name__
@@ -634,7 +637,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         ValueError
             If X is not a finite array of four columns, or has other names of columns than in `fit`.
         """
-        check_is_fitted(self)
+        check_is_fitted(self, "F_")
         return self._inliers(self._validated(X, reset=False))
 
     def score_samples(self, X: ArrayLike) -> NDArray[np.float64]:
@@ -658,7 +661,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         ValueError
             If X is not a finite array of four columns, or has other names of columns than in `fit`.
         """
-        check_is_fitted(self)
+        check_is_fitted(self, "F_")
         return -self._residuals(self._validated(X, reset=False))
 
     def decision_function(self, X: ArrayLike) -> NDArray[np.float64]:
@@ -681,7 +684,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         ValueError
             If X is not a finite array of four columns, or has other names of columns than in `fit`.
         """
-        check_is_fitted(self)
+        check_is_fitted(self, "F_")
         return self.threshold_ - self._residuals(self._validated(X, reset=False))
 
     def score(self, X: ArrayLike, y: Any = None) -> float:
@@ -706,7 +709,7 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         ValueError
             If X is not a finite array of four columns, or has other names of columns than in `fit`.
         """
-        check_is_fitted(self)
+        check_is_fitted(self, "F_")
         residuals = self._residuals(self._validated(X, reset=False))
         relative = np.minimum(residuals, self.threshold_) / self.threshold_
         return float((1 - np.square(relative)).mean())

@@ -654,6 +654,22 @@ def test_as_a_module_with_a_reader_that_leaves(tmp_path, n, code, said):
     assert (tmp_path / "out.npz").exists() == (code == 0)
 
 
+def test_as_a_module_where_the_terminal_has_other_letters(tmp_path):
+    np.savetxt(tmp_path / "x.csv", SCENE.X, delimiter=",")
+    done = subprocess.run(
+        [sys.executable, "-m", "cv_densityf", "match", "--points", "x.csv", "-o", "日本.npz"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert r"\u65e5\u672c.npz" in done.stdout
+    assert (tmp_path / "日本.npz").exists()
+
+
 @pytest.mark.skipif(os.name == "nt", reason="needs a POSIX shell")
 @pytest.mark.parametrize(
     ("arguments", "code"), [("match --points x.csv", 0), ("match --points y.csv", 2)]

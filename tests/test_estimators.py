@@ -319,6 +319,18 @@ def test_no_fundamental_matrix_says_why():
             FundamentalMatrixEstimator(prefilter).fit(X)
 
 
+def test_a_fit_that_fails_leaves_nothing_of_the_last(scene):
+    one_spot = np.tile([1.0, 2.0, 3.0, 4.0], (30, 1))
+    for estimator in (FundamentalMatrixEstimator(), FundamentalMatrixEstimator().fit(scene.X)):
+        with pytest.raises(ValueError, match="no fundamental matrix"):
+            estimator.fit(one_spot)
+        assert not hasattr(estimator, "F_")
+        assert not hasattr(estimator, "inlier_mask_")
+        for method in ("predict", "score", "score_samples", "decision_function"):
+            with pytest.raises(NotFittedError):
+                getattr(estimator, method)(scene.X)
+
+
 @pytest.mark.parametrize("estimator", [FundamentalMatrixEstimator(), DensityPeaksFilter()])
 def test_the_columns_are_named(scene, estimator):
     with pytest.raises(ValueError, match="x, y in the first image and x', y' in the second"):

@@ -8,6 +8,7 @@ import re
 import struct
 import tracemalloc
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pandas
@@ -351,6 +352,16 @@ class TestCsv:
 def test_other_kinds_of_files_are_named(tmp_path):
     with pytest.raises(InputError, match=r"matches.txt: .*\.npz or a \.csv"):
         read_matches(tmp_path / "matches.txt")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
+def test_an_npz_in_a_pipe_is_refused(tmp_path):
+    path = tmp_path / "pipe.npz"
+    os.mkfifo(path)
+    with ThreadPoolExecutor(1) as writer:
+        writer.submit(path.write_bytes, b"PK")
+        with pytest.raises(InputError, match=r"a pipe; an \.npz has to be a file"):
+            read_matches(path)
 
 
 @pytest.mark.parametrize("name", ["matches.npz", "matches.csv"])
