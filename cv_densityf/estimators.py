@@ -167,7 +167,7 @@ class DensityPeaks(ClusterMixin, BaseEstimator):  # type: ignore[misc]
         self.alpha = alpha
         self.dc = dc
         self.dc_percent = dc_percent
-        self.kernel = kernel
+        self.kernel: Kernel = kernel
         self.sample_size = sample_size
         self.halo = halo
 

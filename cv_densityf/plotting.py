@@ -22,6 +22,7 @@ from cv_densityf.matching import grey
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.legend import Legend
 
 #: Okabe and Ito's seven colours, then two of Tol's and white: as many as there are lines.
 _LINE_COLORS = (
@@ -495,6 +496,7 @@ def _show(
             )  # fmt: skip
         frame = np.array([[left, right, right, left, left], [top, top, bottom, bottom, top]])
         ax.plot(*frame, color="0.4", lw=1, zorder=1, clip_on=False)
+    right = places[1](extent2)[1, 0]
     ax.set(xlim=(0, right), ylim=(max(height, scale * height2), 0), aspect="equal")
     ax.axis("off")
     return places
@@ -521,14 +523,20 @@ def _legend_above(ax: Axes, handles: list[Any]) -> None:
     if layout is not None:
         layout.execute(figure.figure)  # which tells how wide the axes are
     width = ax.get_position(original=True).width * figure.bbox.width
-    for size, n_lines in [*itertools.product((11, 9, 7), (1, 2, 3, 4)), (7, len(handles))]:
-        legend = ax.legend(
+
+    def drawn(size: int, n_lines: int) -> Legend:
+        return ax.legend(
             handles=handles, loc="lower center", bbox_to_anchor=(0.5, 1.0),
             ncols=-(-len(handles) // n_lines), frameon=False, fontsize=size, markerscale=1.6,
             columnspacing=1.5,
         )  # fmt: skip
+
+    first, *others = [*itertools.product((11, 9, 7), (1, 2, 3, 4)), (7, len(handles))]
+    legend = drawn(*first)
+    for smaller in others:
         if legend.get_window_extent().width <= width:
             break
+        legend = drawn(*smaller)
     if layout is None:
         ax.apply_aspect()  # which tells where the legend will be
         over = (legend.get_window_extent().y1 - figure.bbox.y1) / figure.bbox.height
