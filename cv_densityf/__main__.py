@@ -102,14 +102,14 @@ def _warn(text: str) -> None:
 
 def _say(*words: object, sep: str = " ") -> None:
     """Print, and do without where the reader, such as `head`, has had enough."""
+    text = sep.join(map(str, words))
     try:
-        print(*words, sep=sep, flush=True)
+        print(text, flush=True)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except UnicodeEncodeError:  # such as a path of other letters than the terminal's
         encoding = sys.stdout.encoding
-        text = sep.join(map(str, words)).encode(encoding, "backslashreplace").decode(encoding)
-        print(text, flush=True)
+        print(text.encode(encoding, "backslashreplace").decode(encoding), flush=True)
 
 
 class _Parser(argparse.ArgumentParser):

@@ -321,7 +321,7 @@ def eight_point(samples: Floats) -> NDArray[np.float64]:
         points.append(Z)
     A = (points[1][..., :, None] * points[0][..., None, :]).reshape(m, k, 9)
     G = np.linalg.svd(A, full_matrices=True)[2][:, 8].reshape(m, 3, 3)
-    F = transforms[1].transpose(0, 2, 1) @ _rank_two(G)[0] @ transforms[0]
+    F = transforms[1].transpose(0, 2, 1) @ _rank_two(G) @ transforms[0]
     return np.asarray(F / np.linalg.norm(F, axis=(1, 2), keepdims=True))
 
 
@@ -408,7 +408,7 @@ def refine(
         hessian += pull * slope[:, None] * slope
         gradient += (pull * lack[0] * slope)[:, None]
         G = at.moved(hessian, gradient)
-    return np.asarray(_rank_two(G)[0][0])
+    return np.asarray(_rank_two(G)[0])
 
 
 class _Linearized:
@@ -485,8 +485,8 @@ def _cofactors(G: Floats) -> Floats:
     return (factors[:, 0] * factors[:, 1] - factors[:, 2] * factors[:, 3]).reshape(-1, 3, 3)
 
 
-def _rank_two(G: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Nearest matrices (m, 3, 3) of rank 2 and of unit norm, and U, S, V^T of these."""
+def _rank_two(G: Floats) -> Floats:
+    """Nearest matrices (m, 3, 3) of rank 2 and of unit norm."""
     U, S, Vt = np.linalg.svd(G)
     S = S[:, :2] / np.hypot(S[:, :1], S[:, 1:2])
-    return (U[:, :, :2] * S[:, None]) @ Vt[:, :2], U, S, Vt
+    return np.asarray((U[:, :, :2] * S[:, None]) @ Vt[:, :2])

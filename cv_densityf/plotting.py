@@ -496,8 +496,9 @@ def _show(
             )  # fmt: skip
         frame = np.array([[left, right, right, left, left], [top, top, bottom, bottom, top]])
         ax.plot(*frame, color="0.4", lw=1, zorder=1, clip_on=False)
-    right = places[1](extent2)[1, 0]
-    ax.set(xlim=(0, right), ylim=(max(height, scale * height2), 0), aspect="equal")
+    ax.set(
+        xlim=(0, places[1](extent2)[1, 0]), ylim=(max(height, scale * height2), 0), aspect="equal"
+    )
     ax.axis("off")
     return places
 
