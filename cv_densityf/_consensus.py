@@ -32,10 +32,14 @@ Bools = NDArray[np.bool_]
 NEAR = 0.0
 #: Draws from all matches, whatever the density says, in the order of the caller's scores.
 BY_SCORE = -1.0
+#: Draws from half of the ranked matches, spread over the image: the most reliable of each cell, then
+#: the second of each, and so on. Of what moves on its own, a crowd mostly, few are among them.
+SPREAD = -2.0
+_SPREAD_OF = 0.75
 #: Shares of the ranked matches, most reliable first, that hypotheses are drawn from, round by
 #: round.
 ROUNDS = (
-    (0.25, 0.5),
+    (0.25, SPREAD),
     (BY_SCORE, 0.75, NEAR),
     (0.125, BY_SCORE, 1.0),
     (0.5, BY_SCORE, NEAR),
@@ -58,9 +62,8 @@ MIN_DRAW = 30
 #: pure parts. More find no better F; several short draws do.
 MAX_DRAW_ITERS = 1000
 #: Two hypotheses agree when their inlier sets have this intersection over union; then there are no
-#: more draws. If it is less than the second, local optimisation has something to gain.
+#: more draws.
 _AGREEMENT = 0.93
-_CLOSE_AGREEMENT = 0.98
 #: Where a plane is dominant, a hypothesis with this share of the most votes, and so many standard
 #: deviations of chance more inliers off the plane, is the better one: these fix F, and are often
 #: sparse and of little reliability. With fewer votes it fits a crowd of wrong ones there.
@@ -74,17 +77,22 @@ _PLANAR = 0.9
 _BY_CHANCE = (8, 0.03)
 #: Draws from parts whose sizes differ by less than this factor are not independent.
 _DISTINCT = 1.4
-#: Largest size of the samples of the local optimisation, how many working thresholds from the
-#: hypothesis they are taken, and how far their polish and their vote look.
-_LOCAL_SIZE = 14
+#: Largest size of the samples of the local optimisation, how many of its widths from the hypothesis
+#: they are taken, and how far and at how many matches at most their polish and their vote look.
+_LOCAL_SIZE = 10
 _LOCAL_WIDTH = 3.0
 _LOCAL_REACH = 20.0
-_LOCAL_STEPS = 2
-#: Number of samples where draws agree, or where it is hopeless, and of the best ones, which are
-#: polished.
-_LOCAL_SAMPLES = (32, 8)
-#: Where none do, the right F may be next to another hypothesis than the best: the same numbers
-#: from each of so many, whose inliers have less than this intersection over union.
+_LOCAL_MATCHES = 1_000
+_LOCAL_STEPS = 3
+#: Of the winner it is at a width of so many robust standard deviations of the residuals. Number of
+#: samples, and of the best ones, which are polished.
+_LOCAL_SIGMAS = 2.5
+_LOCAL_SAMPLES = (24, 8)
+#: Threshold of a draw for what most matches agree on, in these standard deviations.
+_MAJORITY_SIGMAS = 1.2
+#: Before that, where no draws agree, the right F may be next to another hypothesis than the best:
+#: the same numbers at the working threshold from each of so many, whose inliers have less than this
+#: intersection over union.
 _LOCAL_SAMPLES_IN_DOUBT = (96, 16)
 _LOCAL_STARTS_IN_DOUBT = 2
 _SAME_BASIN = 0.8
@@ -97,7 +105,7 @@ _GRID = 16
 #: Width of the weights in the polish, in units of the working threshold.
 _POLISH_WIDTH = 0.7
 _POLISH_STEPS = 2
-_REFINE_STEPS = 3
+_REFINE_STEPS = 2
 #: The noise that the last steps reckon with, at least, in units of the threshold.
 _NARROWEST = 0.03
 #: For the last steps, right matches are counted within so many sigmas of their lines, wrong ones
@@ -151,6 +159,7 @@ def search(
     about: tuple[Floats, float] | None = None,
     scores: Floats | None = None,
     others: Floats | None = None,
+    majority: bool = False,
 ) -> Consensus | None:
     """Search for the fundamental matrix that the reliable and well spread matches vote for.
 
@@ -159,8 +168,8 @@ def search(
     inliers there. Each hypothesis is polished on all matches. The draws end when a second,
     independent one arrives at the best hypothesis's inliers, and one from what these leave, if that
     is much, is no better; or after `ROUNDS` on each ranking, or where there is no hope. Where most
-    inliers are on a plane, other hypotheses of that plane are then tried. Unless two draws are
-    nearly the same, the best hypothesis is optimised locally; where none agree, others as well.
+    inliers are on a plane, other hypotheses of that plane are then tried. Where no draws agree, the
+    best hypotheses are optimised locally; the winner always is, within its noise.
 
     Parameters
     ----------
@@ -188,6 +197,9 @@ def search(
     others : array, shape (k, 4), optional
         Matches that are not searched: with the rest they vote on the best hypotheses, and polish
         the winner.
+    majority : bool
+        Whether what most matches agree on closely is wanted, as from LMEDS, rather than what as
+        many as possible agree on within the threshold. One more draw is at their noise then.
 
     Returns
     -------
@@ -217,9 +229,24 @@ def search(
     if pool is None:
         return None
     pool.complete()
-    if not pool.agrees(_CLOSE_AGREEMENT):
-        pool.optimise(in_vain)
-    F = (pool if others is None else pool.before(others - centre)).refined_best()
+    if not (in_vain or pool.agrees()):
+        pool.optimise()
+    drawn = None
+    if majority:
+        watch.lap("polish")
+        some = np.flatnonzero(pool.near_best(_NEAR_WIDTH))
+        if len(some) > _LOCAL_MATCHES:
+            some = rng.choice(some, _LOCAL_MATCHES, replace=False, shuffle=False)
+        drawn = draw(
+            X[some].astype(np.float32),
+            max(_MAJORITY_SIGMAS * pool.noise, _NARROWEST * threshold),
+            confidence,
+            min(max_iters, _SHORT_DRAW_ITERS),
+            seed + n_draws,
+        )
+        n_draws += 1
+        watch.lap("draws")
+    F = (pool if others is None else pool.before(others - centre)).refined_best(drawn)
     F = shift(-centre[2:]).T @ F @ shift(-centre[:2])
     watch.lap("polish")
     agreed = pool.agrees_independently()
@@ -276,6 +303,8 @@ def _fill(
                 part = X[np.argsort(-scores, kind="stable")].astype(np.float32)
             elif fraction == NEAR and len(pool):
                 part = points[pool.near_best(_NEAR_WIDTH)[order]]
+            elif fraction == SPREAD:
+                part = points[pool.spread(order)]
             elif fraction > 0.0:
                 part = points[: max(MIN_DRAW, int(len(order) * fraction))]
             else:
@@ -413,6 +442,17 @@ class _Pool:
         """Mark the matches within ``width`` working thresholds of the best hypothesis."""
         return np.asarray(self._squared[self.best] < (width * self.working) ** 2)
 
+    @property
+    def noise(self) -> float:
+        """Robust standard deviation of the best hypothesis's residuals, pixels."""
+        return _noise(self._squared[self.best, self._reliable], self.threshold)
+
+    def spread(self, order: Ints) -> Ints:
+        """Places in an order, most reliable first, of half of its matches, in turn of all cells."""
+        top = order[: max(MIN_DRAW, int(_SPREAD_OF * len(order)))]
+        turns = self._ballot.turns(top)
+        return np.argsort(turns, kind="stable")[: max(MIN_DRAW, len(order) // 2)]
+
     def coherent(self) -> bool:
         """Whether the inliers of the best hypothesis stay neighbours, as those of a scene do."""
         return len(self) > 0 and coherence(self._X[self.near_best(1.0)]) > COHERENT
@@ -432,42 +472,48 @@ class _Pool:
             self._off_plane = off_plane
             self._join(G, np.zeros(len(G)))
 
-    def optimise(self, hopeless: bool) -> None:
-        """Optimise the best hypothesis locally; if draws do not agree on it, others as well.
+    def optimise(self) -> None:
+        """Optimise the best hypotheses locally; what comes of them joins."""
+        for start in self._finalists(_LOCAL_STARTS_IN_DOUBT, _SAME_BASIN):
+            G = self._optimised(
+                self._G[start], self._squared[start], self.working, *_LOCAL_SAMPLES_IN_DOUBT
+            )
+            self._append(G[None], *self._poll(G[None]), [0])
 
-        Only the best one where there is hardly a right match.
+    def _optimised(
+        self,
+        G: Floats,
+        squared: Floats,
+        width: float,
+        n_samples: int,
+        n_polished: int,
+        others: Floats | None = None,
+    ) -> Floats:
+        """Step from a hypothesis on samples of its near matches, polish the best, and choose one.
 
-        The inner sampling of Chum, Matas and Kittler, "Locally optimized RANSAC" (2003), with the
-        vote as its score.
+        Or one of the ``others`` (m, 3, 3). The inner sampling of Chum, Matas and Kittler, "Locally
+        optimized RANSAC" (2003), with the vote as its score. The matches it is not far from polish
+        and vote, some of many.
         """
-        if self.agrees() or hopeless:
-            self._optimise_from(self.best, *_LOCAL_SAMPLES)
-        else:
-            for start in self._finalists(_LOCAL_STARTS_IN_DOUBT, _SAME_BASIN):
-                self._optimise_from(start, *_LOCAL_SAMPLES_IN_DOUBT)
-
-    def _optimise_from(self, start: int, n_samples: int, n_polished: int) -> None:
-        """Step from a hypothesis on samples of its near matches, and polish the best; one joins.
-
-        The matches it is not far from polish, and choose by their votes.
-        """
-        rows = self._squared[start] < (_LOCAL_REACH * self.working) ** 2
-        near = self._squared[start, rows] < (_LOCAL_WIDTH * self.working) ** 2
+        rows = np.flatnonzero(squared < (_LOCAL_REACH * width) ** 2)
+        if len(rows) > _LOCAL_MATCHES:
+            rows = self._rng.choice(rows, _LOCAL_MATCHES, replace=False, shuffle=False)
+        near = squared[rows] < (_LOCAL_WIDTH * width) ** 2
         size = min(_LOCAL_SIZE, int(np.count_nonzero(near)) // 2)
         if size < 8:
-            return
+            return G
         keys = np.where(near, self._rng.random((n_samples, len(near))), np.inf)
         samples = keys < np.partition(keys, size, axis=1)[:, size, None]
         part = self._frame.part(rows)
-        G = polish(part, self._G[[start]], [np.inf], samples=samples)
+        several = polish(part, G[None], [np.inf], samples=samples)
         # Of so many, in a hurry: without cells and cameras, and at the largest width alone.
-        widest = _VOTE_WIDTHS[-1] * self.working
-        votes = np.maximum(1.0 - part.sampson(G) / widest**2, 0.0) @ self._reliability[rows]
-        G = G[np.argsort(-votes, kind="stable")[:n_polished]]
-        G = polish(part, G, [_POLISH_WIDTH * self.working] * _LOCAL_STEPS)
-        votes = self._ballot.part(rows).count(part.sampson(G), self.working) * _credit(G)
-        G = G[[votes.argmax()]]
-        self._append(G, *self._poll(G), [0])
+        widest = _VOTE_WIDTHS[-1] * width
+        votes = np.maximum(1.0 - part.sampson(several) / widest**2, 0.0) @ self._reliability[rows]
+        several = several[np.argsort(-votes, kind="stable")[:n_polished]]
+        several = np.concatenate([G[None], several, *([] if others is None else [others])])
+        several = polish(part, several, [_POLISH_WIDTH * width] * _LOCAL_STEPS)
+        votes = self._ballot.part(rows).count(part.sampson(several), width) * _credit(several)
+        return np.asarray(several[votes.argmax()])
 
     @property
     def planar(self) -> float:
@@ -508,12 +554,17 @@ class _Pool:
         sizes = sizes[alike & (sizes > 0)]
         return len(sizes) > 1 and bool(sizes.max() >= _DISTINCT * sizes.min())
 
-    def refined_best(self) -> NDArray[np.float64]:
-        """Polish the best hypothesis at the width of its own residuals; in pixels, (3, 3).
+    def refined_best(self, drawn: Floats | None = None) -> NDArray[np.float64]:
+        """Optimise the best hypothesis at the width of its own residuals; in pixels, (3, 3).
 
-        Of many matches as long as it moves, before the last steps.
+        Unless that makes one ``drawn`` at this width (3, 3) the better one. Of many matches polish
+        it as long as it moves, before the last steps.
         """
         G, squared = self._G[self.best], self._squared[self.best]
+        width = _LOCAL_SIGMAS * max(self.noise, _NARROWEST * self.threshold)
+        others = None if drawn is None else self._frame.enter(drawn[None])
+        G = self._optimised(G, squared, width, *_LOCAL_SAMPLES, others)
+        squared = self._frame.sampson(G[None])[0]
         if len(squared) > _MANY:
             G = self._settled(G, squared)
             squared = self._frame.sampson(G[None])[0]
@@ -637,13 +688,20 @@ class _Ballot:
         self._cells = np.stack([_cells(X[:, :2]), _cells(X[:, 2:]) + _GRID * _GRID])
         self._order, self._starts = _groups(self._cells)
 
-    def part(self, rows: Bools) -> _Ballot:
-        """Return the same ballot, holding only the matches marked in ``rows`` (n,)."""
+    def part(self, rows: Ints) -> _Ballot:
+        """Return the same ballot, holding only the matches of the given rows."""
         part = copy(self)
         part._reliability = self._reliability[rows]
         part._cells = self._cells[:, rows]
         part._order, part._starts = _groups(part._cells)
         return part
+
+    def turns(self, rows: Ints) -> Ints:
+        """How many of the rows before each one are in the same cell of the first image."""
+        order, starts = _groups(self._cells[:1, rows])
+        turns = np.empty_like(order)
+        turns[order] = np.arange(len(order)) - starts.repeat(np.diff(starts, append=len(order)))
+        return turns
 
     def count(self, squared: Floats, working: float) -> Floats:
         """Votes for each hypothesis from its squared residuals (m, n), (m,)."""

@@ -145,11 +145,11 @@ class Frame:
         self._first, self._from_first = zoom @ shift(-centre[:2]), shift(centre[:2]) @ unzoom
         self._second, self._from_second = zoom @ shift(-centre[2:]), shift(centre[2:]) @ unzoom
 
-    def part(self, rows: NDArray[np.bool_]) -> Frame:
-        """Return the same frame, holding only the matches marked in ``rows`` (n,)."""
+    def part(self, rows: NDArray[np.intp]) -> Frame:
+        """Return the same frame, holding only the matches of the given rows."""
         part = copy(self)
         for name in ("_outer", "_squares", "products"):
-            setattr(part, name, getattr(self, name)[:, rows])
+            setattr(part, name, getattr(self, name).take(rows, axis=1))
         return part
 
     def enter(self, F: Floats) -> Floats:

@@ -210,7 +210,14 @@ def _estimate(
                     searched[rows] = True
                     others = X[heard[~searched[heard]]] * units.repeat(2)
                 found = search(
-                    Z, rankings, watch=watch, about=about, scores=trust, others=others, **asked
+                    Z,
+                    rankings,
+                    watch=watch,
+                    about=about,
+                    scores=trust,
+                    others=others,
+                    majority=robust.rule == "lmeds",
+                    **asked,
                 )
         except np.linalg.LinAlgError:
             found = None

@@ -83,8 +83,7 @@ def plane_and_parallax(
     hypotheses = (np.cross(through[first], through[second]) @ family.T).reshape(-1, 3, 3)
     with np.errstate(invalid="ignore"):
         hypotheses /= np.linalg.norm(hypotheses, axis=(1, 2), keepdims=True)
-    judges = np.zeros_like(off_plane)
-    judges[rng.permutation(np.flatnonzero(off_plane))[:_JUDGES]] = True
+    judges = rng.permutation(np.flatnonzero(off_plane))[:_JUDGES]
     squared = frame.part(judges).sampson(hypotheses)
     votes = np.maximum(0.0, 1.0 - squared / width**2).sum(axis=1)
     best = np.argsort(-votes, kind="stable")[:_BEST]
