@@ -25,6 +25,9 @@ N_PATCHES = 10
 N_TRUTH = 200
 #: Texture that repeats does so after this many pixels.
 PERIOD = 60.0
+#: What moves on its own: so many patches, by pixels of this standard deviation across and down.
+N_MOVING = 3
+STRIDE = (40.0, 12.0)
 
 
 @dataclass(frozen=True)
@@ -37,12 +40,14 @@ class Kind:
         Share of the true matches on the wall.
     truth_wall : float
         Share of the truth points on the wall: what leaves the wall must fit as well.
-    motion : {"sideways", "forward", "none"}
-        Of the second camera; "none" only turns it.
+    motion : {"sideways", "forward", "video", "none"}
+        Of the second camera; "video" is a short step, "none" only turns it.
     coherent : float
         Share of the wrong matches that pair the wall with itself one period further down. An F
         with its epipole in that direction explains them together with the true ones on the wall;
         few enough are on it that the truth still has the majority.
+    moving : float
+        Share of the wrong matches that are on patches which move on their own.
     unique : bool
         Whether the matches fix F. If not, any F that explains them is right.
     """
@@ -51,6 +56,7 @@ class Kind:
     truth_wall: float = 0.2
     motion: str = "sideways"
     coherent: float = 0.0
+    moving: float = 0.0
     unique: bool = True
 
 
@@ -61,6 +67,7 @@ KINDS: dict[str, Kind] = {
     "forward": Kind(motion="forward"),
     "one_plane": Kind(wall=1.0, truth_wall=1.0, unique=False),
     "rotation": Kind(motion="none", unique=False),
+    "moving_objects": Kind(wall=0.7, motion="video", moving=0.9),
 }
 
 #: Numbers of matches, inlier ratios and noise (px) of each kind, unless asked otherwise.
@@ -122,10 +129,13 @@ def make_scene(kind: str, n: int, inlier_ratio: float, noise: float, seed: int =
 
     n_true = round(n * inlier_ratio)
     n_coherent = round((n - n_true) * spec.coherent)
+    n_moving = round((n - n_true) * spec.moving)
     true = world.matches(n_true, spec.wall, rng)
-    wrong = rng.uniform(0, np.tile(SIZE, 2), (n - n_true - n_coherent, 4))
+    wrong = rng.uniform(0, np.tile(SIZE, 2), (n - n_true - n_coherent - n_moving, 4))
     coherent = world.matches(n_coherent, 1.0, rng, period=PERIOD)
-    X = np.vstack([*(x + rng.normal(0, noise, x.shape) for x in (true, coherent)), wrong])
+    moving = world.moving_matches(n_moving, rng)
+    noisy = [x + rng.normal(0, noise, x.shape) for x in (true, coherent, moving)]
+    X = np.vstack([*noisy, wrong])
     # SIFT ratios: true matches are lower, with a wide overlap.
     ratio = np.concatenate([rng.beta(5, 3, n_true), rng.beta(12, 2, n - n_true)])
     order = rng.permutation(n)
@@ -144,14 +154,15 @@ def make_scene(kind: str, n: int, inlier_ratio: float, noise: float, seed: int =
 
 def _motion(motion: str, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Rotation of up to some 10 degrees, and a step."""
-    angles = rng.uniform(-0.02, 0.02, 3) if motion == "forward" else rng.uniform(-0.1, 0.1, 3)
+    largest = 0.02 if motion in ("forward", "video") else 0.1
+    angles = rng.uniform(-largest, largest, 3)
     R = np.asarray(cv2.Rodrigues(angles)[0], dtype=np.float64)
     if motion == "none":
         return R, np.zeros(3)
     if motion == "forward":
         return R, np.array([*rng.uniform(-0.1, 0.1, 2), -1.0])
     t = np.array([rng.choice([-1.0, 1.0]), *rng.uniform(-0.5, 0.5, 2)])
-    return R, 0.8 * t / np.linalg.norm(t)
+    return R, (0.08 if motion == "video" else 0.8) * t / np.linalg.norm(t)
 
 
 def _fundamental(K: Floats, R: Floats, t: Floats) -> Floats:
@@ -173,16 +184,24 @@ class _World:
         self.slopes = rng.uniform(-2e-4, 2e-4, (N_PATCHES, 2))
         self.wall_slope = rng.uniform(-3e-5, 3e-5, 2)
 
-    def matches(self, n: int, wall: float, rng: np.random.Generator, period: float = 0.0) -> Floats:
+    def matches(
+        self,
+        n: int,
+        wall: float,
+        rng: np.random.Generator,
+        period: float = 0.0,
+        patches: tuple[int, int] = (0, N_PATCHES),
+    ) -> Floats:
         """Project points that both cameras see, ``wall`` of them on the wall, (n, 4).
 
-        With a ``period`` the second camera's point is the one that many pixels further down.
+        The others are on the patches from the first up to the second number. With a ``period`` the
+        second camera's point is the one that many pixels further down.
         """
         found = np.empty((0, 4))
         while len(found) < n:
             # More than are missing: some fall outside an image.
             count = 2 * (n - len(found)) + 16
-            points1, inverse_depth, slope = self._surface_points(count, wall, rng)
+            points1, inverse_depth, slope = self._surface_points(count, wall, rng, patches)
             step = np.array([0.0, period])
             points2, depth2 = self._project(points1 + step, inverse_depth + slope @ step)
             X = np.hstack([points1, points2])
@@ -191,11 +210,21 @@ class _World:
             found = np.vstack([found, X[seen]])
         return found[:n]
 
+    def moving_matches(self, n: int, rng: np.random.Generator) -> Floats:
+        """Return matches of patches that are elsewhere in the second image, (n, 4)."""
+        if not n:
+            return np.empty((0, 4))
+        parts = [n // N_MOVING + (i < n % N_MOVING) for i in range(N_MOVING)]
+        found = [self.matches(size, 0.0, rng, patches=(i, i + 1)) for i, size in enumerate(parts)]
+        for X in found:
+            X[:, 2:] += rng.normal(0, STRIDE)
+        return np.vstack(found)
+
     def _surface_points(
-        self, count: int, wall: float, rng: np.random.Generator
+        self, count: int, wall: float, rng: np.random.Generator, patches: tuple[int, int]
     ) -> tuple[Floats, Floats, Floats]:
         """Image points, their inverse depths and their surfaces' slopes."""
-        patch = rng.integers(0, N_PATCHES, count)
+        patch = rng.integers(*patches, count)
         offset = rng.normal(0, 1, (count, 2)) * self.spreads[patch, None]
         points = self.centers[patch] + offset
         slope = self.slopes[patch]

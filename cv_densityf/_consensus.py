@@ -32,8 +32,9 @@ Bools = NDArray[np.bool_]
 NEAR = 0.0
 #: Draws from all matches, whatever the density says, in the order of the caller's scores.
 BY_SCORE = -1.0
-#: Draws from half of the ranked matches, spread over the image: the most reliable of each cell, then
-#: the second of each, and so on. Of what moves on its own, a crowd mostly, few are among them.
+#: Draws from half of the ranked matches, spread over the image: of the most reliable, which are
+#: this share, the first of each cell, then the second of each, and so on. What moves on its own, a
+#: crowd mostly, has few among them.
 SPREAD = -2.0
 _SPREAD_OF = 0.75
 #: Shares of the ranked matches, most reliable first, that hypotheses are drawn from, round by
@@ -88,8 +89,10 @@ _LOCAL_STEPS = 3
 #: samples, and of the best ones, which are polished.
 _LOCAL_SIGMAS = 2.5
 _LOCAL_SAMPLES = (24, 8)
-#: Threshold of a draw for what most matches agree on, in these standard deviations.
+#: Threshold of a draw for what most matches agree on, in these standard deviations, and how many
+#: near matches it is from.
 _MAJORITY_SIGMAS = 1.2
+_MAJORITY_OF = 300
 #: Before that, where no draws agree, the right F may be next to another hypothesis than the best:
 #: the same numbers at the working threshold from each of so many, whose inliers have less than this
 #: intersection over union.
@@ -235,8 +238,8 @@ def search(
     if majority:
         watch.lap("polish")
         some = np.flatnonzero(pool.near_best(_NEAR_WIDTH))
-        if len(some) > _LOCAL_MATCHES:
-            some = rng.choice(some, _LOCAL_MATCHES, replace=False, shuffle=False)
+        if len(some) > _MAJORITY_OF:
+            some = rng.choice(some, _MAJORITY_OF, replace=False, shuffle=False)
         drawn = draw(
             X[some].astype(np.float32),
             max(_MAJORITY_SIGMAS * pool.noise, _NARROWEST * threshold),

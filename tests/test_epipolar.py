@@ -282,7 +282,7 @@ def test_a_part_of_a_frame_is_the_frame_of_fewer_matches():
     X = np.empty((300, 4))
     X[rows], X[~rows] = scene.X, others
     whole, alone = Frame(X), Frame(scene.X)
-    part = whole.part(rows)
+    part = whole.part(np.flatnonzero(rows))
     F = scene.F[None]
     start = perturbed(alone, scene.F, 0, 1e-3)
     for frame in (part, whole):
@@ -539,7 +539,7 @@ def test_the_first_step_of_polish_may_be_on_samples():
     second = polish(frame, start, [np.inf, 2.0], samples=samples)
     on_all = polish(frame, first, [2.0])
     for i, sample in enumerate(samples):
-        part = frame.part(sample)
+        part = frame.part(np.flatnonzero(sample))
         alone = polish(part, start, [np.inf])
         np.testing.assert_allclose(unit(first[i]), unit(alone[0]), atol=1e-9)
         way = np.linalg.norm(unit(on_all[i]) - unit(polish(part, alone, [2.0])[0]))
