@@ -234,6 +234,7 @@ def search(
     pool.complete()
     if not (in_vain or pool.agrees()):
         pool.optimise()
+    agreed, virtue, planar = pool.agrees_independently(), pool.virtue, pool.planar
     drawn = None
     if majority:
         watch.lap("polish")
@@ -249,18 +250,18 @@ def search(
         )
         n_draws += 1
         watch.lap("draws")
-    F = (pool if others is None else pool.before(others - centre)).refined_best(drawn)
+    G = pool.optimised_best(drawn)
+    F = pool.refined(G) if others is None else pool.settled_by(others - centre, G)
     F = shift(-centre[2:]).T @ F @ shift(-centre[:2])
     watch.lap("polish")
-    agreed = pool.agrees_independently()
     again = "found again by another" if agreed else "found by no other"
-    reason = f"the hypothesis with {pool.virtue} of {n_draws} draws, {again}"
+    reason = f"the hypothesis with {virtue} of {n_draws} draws, {again}"
     if in_vain:
         reason += (
             "; the search ended early: matches lie together only as by chance, and so do the "
             "inliers"
         )
-    elif (planar := pool.planar) > _PLANAR:
+    elif planar > _PLANAR:
         # Draws that have the same inliers may have another F.
         agreed = False
         reason += (
@@ -424,15 +425,20 @@ class _Pool:
         self._inliers = np.concatenate([self._inliers, inliers])
         self.votes = np.concatenate([self.votes, votes])
         self._sizes = np.concatenate([self._sizes, sizes])
-        self.best = int(self.votes.argmax()) if self._off_plane is None else self._richest()
+        self.best = self._elected(self.votes, self._inliers)
 
-    def _richest(self) -> int:
-        """Index of the most votes, or of nearly as many and more inliers off the plane."""
-        elected = int(self.votes.argmax())
-        off_plane = self._inliers[:, self._off_plane]
+    def _elected(self, votes: Floats, inliers: Floats, rows: Ints | slice = slice(None)) -> int:
+        """Index of the most votes (m,), or of nearly as many and more inliers off a dominant plane.
+
+        ``inliers`` (m, k) are of the given rows.
+        """
+        elected = int(votes.argmax())
+        if self._off_plane is None:
+            return elected
+        off_plane = inliers[:, self._off_plane[rows]]
         gain = off_plane - off_plane[elected]
         lead = gain.sum(axis=1) - _SIGNIFICANT * np.sqrt(np.abs(gain).sum(axis=1))
-        lead[self.votes < _NEARLY * self.votes[elected]] = -np.inf
+        lead[votes < _NEARLY * votes[elected]] = -np.inf
         # Its own lead is 0.
         return int(lead.argmax()) if lead.max() > 0 else elected
 
@@ -515,8 +521,10 @@ class _Pool:
         several = several[np.argsort(-votes, kind="stable")[:n_polished]]
         several = np.concatenate([G[None], several, *([] if others is None else [others])])
         several = polish(part, several, [_POLISH_WIDTH * width] * _LOCAL_STEPS)
-        votes = self._ballot.part(rows).count(part.sampson(several), width) * _credit(several)
-        return np.asarray(several[votes.argmax()])
+        squared = part.sampson(several)
+        votes = self._ballot.part(rows).count(squared, width) * _credit(several)
+        inliers = (squared < width**2).astype(np.float32)
+        return np.asarray(several[self._elected(votes, inliers, rows)])
 
     @property
     def planar(self) -> float:
@@ -557,16 +565,22 @@ class _Pool:
         sizes = sizes[alike & (sizes > 0)]
         return len(sizes) > 1 and bool(sizes.max() >= _DISTINCT * sizes.min())
 
-    def refined_best(self, drawn: Floats | None = None) -> NDArray[np.float64]:
-        """Optimise the best hypothesis at the width of its own residuals; in pixels, (3, 3).
+    def optimised_best(self, drawn: Floats | None = None) -> Floats:
+        """Optimise the best hypothesis at the width of its own residuals; (3, 3), in the frame.
 
-        Unless that makes one ``drawn`` at this width (3, 3) the better one. Of many matches polish
-        it as long as it moves, before the last steps.
+        Or one ``drawn`` at this width, in pixels, if that makes a better one.
         """
-        G, squared = self._G[self.best], self._squared[self.best]
         width = _LOCAL_SIGMAS * max(self.noise, _NARROWEST * self.threshold)
         others = None if drawn is None else self._frame.enter(drawn[None])
-        G = self._optimised(G, squared, width, *_LOCAL_SAMPLES, others)
+        return self._optimised(
+            self._G[self.best], self._squared[self.best], width, *_LOCAL_SAMPLES, others
+        )
+
+    def refined(self, G: Floats) -> NDArray[np.float64]:
+        """Take the last steps from a matrix in the frame; in pixels, (3, 3).
+
+        Of many matches polish it before, as long as it moves.
+        """
         squared = self._frame.sampson(G[None])[0]
         if len(squared) > _MANY:
             G = self._settled(G, squared)
@@ -602,14 +616,19 @@ class _Pool:
                 break
         return chosen
 
-    def before(self, others: Floats) -> _Pool:
-        """Put the finalists to more matches, all equal."""
-        chosen = self._finalists(_FINALISTS, _AGREEMENT)
+    def settled_by(self, others: Floats, G: Floats) -> NDArray[np.float64]:
+        """Let more matches, all equal, choose among the rivals of G; take the last steps with them.
+
+        G stands for the best hypothesis. In pixels, (3, 3).
+        """
+        rivals = self._finalists(_FINALISTS, _AGREEMENT)[1:]
         X = np.concatenate([self._X, others])
         wider = _Pool(X, np.ones(len(X)), self._reliable, self.threshold, self._rng)
         wider.working = self.working
-        wider.add(self._frame.leave(self._G[chosen]), np.zeros(len(chosen)))
-        return wider
+        hypotheses = np.concatenate([G[None], self._G[rivals]])
+        entered = wider._frame.enter(self._frame.leave(hypotheses))
+        wider._append(entered, *wider._poll(entered), np.zeros(len(entered)))
+        return wider.refined(entered[wider.best])
 
 
 def _alike(inliers: Floats, one: Floats, overlap: float) -> Bools:
