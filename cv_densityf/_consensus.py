@@ -21,7 +21,7 @@ from cv_densityf._epipolar import (
     shift,
 )
 from cv_densityf._parallax import FEWEST, plane_and_parallax
-from cv_densityf._prefilter import COHERENT, coherence
+from cv_densityf._prefilter import COHERENT, coherence, places, turns
 from cv_densityf._stopwatch import Stopwatch
 
 Floats = NDArray[np.floating]
@@ -99,8 +99,6 @@ _MAJORITY_OF = 300
 _LOCAL_SAMPLES_IN_DOUBT = (96, 16)
 _LOCAL_STARTS_IN_DOUBT = 2
 _SAME_BASIN = 0.8
-#: Where a point of an image belongs to more than one match in so many, they share a vote.
-_MANY_CLAIM = 10
 #: Widths of the vote, in units of the working threshold.
 _VOTE_WIDTHS = np.array([0.3, 0.5, 0.8, 1.3])
 #: Votes saturate within a cell of this many to the longer side of each image.
@@ -459,8 +457,8 @@ class _Pool:
     def spread(self, order: Ints) -> Ints:
         """Places in an order, most reliable first, of half of its matches, in turn of all cells."""
         top = order[: max(MIN_DRAW, int(_SPREAD_OF * len(order)))]
-        turns = self._ballot.turns(top)
-        return np.argsort(turns, kind="stable")[: max(MIN_DRAW, len(order) // 2)]
+        turn = turns(self._ballot.cells[0, top])
+        return np.argsort(turn, kind="stable")[: max(MIN_DRAW, len(order) // 2)]
 
     def coherent(self) -> bool:
         """Whether the inliers of the best hypothesis stay neighbours, as those of a scene do."""
@@ -645,11 +643,9 @@ def _claimants(X: Floats) -> Floats:
     """
     total = np.ones(len(X))
     for points in (X[:, :2], X[:, 2:]):
-        x = np.sort(points[:, 0])
-        many = len(x) // _MANY_CLAIM
-        if (x[many:] == x[: len(x) - many]).any():
-            _, place, count = np.unique(points, axis=0, return_inverse=True, return_counts=True)
-            total = np.maximum(total, count[place.ravel()])
+        place = places(points)
+        if place is not None:
+            total = np.maximum(total, np.bincount(place)[place])
     return total
 
 
@@ -707,23 +703,16 @@ class _Ballot:
 
     def __init__(self, X: Floats, reliability: Floats) -> None:
         self._reliability = reliability
-        self._cells = np.stack([_cells(X[:, :2]), _cells(X[:, 2:]) + _GRID * _GRID])
-        self._order, self._starts = _groups(self._cells)
+        self.cells = np.stack([_cells(X[:, :2]), _cells(X[:, 2:]) + _GRID * _GRID])
+        self._order, self._starts = _groups(self.cells)
 
     def part(self, rows: Ints) -> _Ballot:
         """Return the same ballot, holding only the matches of the given rows."""
         part = copy(self)
         part._reliability = self._reliability[rows]
-        part._cells = self._cells[:, rows]
-        part._order, part._starts = _groups(part._cells)
+        part.cells = self.cells[:, rows]
+        part._order, part._starts = _groups(part.cells)
         return part
-
-    def turns(self, rows: Ints) -> Ints:
-        """How many of the rows before each one are in the same cell of the first image."""
-        order, starts = _groups(self._cells[:1, rows])
-        turns = np.empty_like(order)
-        turns[order] = np.arange(len(order)) - starts.repeat(np.diff(starts, append=len(order)))
-        return turns
 
     def count(self, squared: Floats, working: float) -> Floats:
         """Votes for each hypothesis from its squared residuals (m, n), (m,)."""

@@ -33,6 +33,8 @@ _COHERENCE_OF = 5_000
 KEPT = 0.5
 #: Of the caller's scores the worst part, one match in so many, is no witness for others.
 _WORST = 5
+#: Where a place holds more than one point in so many, copies are looked for.
+_MANY_COPIES = 10
 #: Rows compared at a time, so that the comparison table stays in the cache.
 _CHUNK = 4096
 
@@ -70,7 +72,13 @@ def density_contrast(
     Y = X - np.partition(X, n // 2, axis=0)[n // 2]
     Y = Y.clip(-_FARTHEST, _FARTHEST).astype(np.float32)
     halves = [np.ascontiguousarray(half) for half in (Y[:, :2], Y[:, 2:])]
-    indices = [cv2.flann.Index(half[among], _KD_TREE) for half in halves]
+    # Among copies of a point the search for neighbours would look at all, each time.
+    searched = [half[among] for half in halves]
+    members = [_without_more_copies(points, k) for points in searched]
+    indices = [
+        cv2.flann.Index(points if some is None else points[some], _KD_TREE)
+        for points, some in zip(searched, members, strict=True)
+    ]
     # A match among them is its own first neighbour, at place 0, or a copy of it is. An outsider
     # sees one neighbour more, which does not count.
     outside = np.ones(n, dtype=np.intp)
@@ -86,7 +94,10 @@ def density_contrast(
             for index, half in zip(indices, halves, strict=True)
         )
         # Long rows are compared faster.
-        columns1, columns2 = np.ascontiguousarray(near1.T), np.ascontiguousarray(near2.T)
+        columns1, columns2 = (
+            np.ascontiguousarray(near.T) if some is None else some[near.T]
+            for near, some in zip((near1, near2), members, strict=True)
+        )
         shared = np.flatnonzero(columns1[:, None] == columns2)
         places, row = np.divmod(shared, len(near1))
         place1, place2 = np.divmod(places, k)
@@ -96,6 +107,34 @@ def density_contrast(
         counts = weight[rank] * other
         contrast[chunk] = np.bincount(row, counts, minlength=len(near1))
     return contrast
+
+
+def places(points: Floats) -> Ints | None:
+    """Give points (n, 2) the number of their place; None if no place has a tenth of them."""
+    n = len(points)
+    x = np.sort(points[:, 0])
+    many = n // _MANY_COPIES
+    if not (x[many:] == x[: n - many]).any():
+        return None
+    # As complex numbers they are sorted several times as fast as by rows.
+    number = np.unique(points[:, 0] + 1j * points[:, 1], return_inverse=True)[1]
+    return np.asarray(number.ravel())
+
+
+def turns(labels: NDArray[np.integer]) -> Ints:
+    """How many before each one have the same label, (n,)."""
+    order = np.argsort(labels, kind="stable")
+    ordered = labels[order]
+    starts = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+    turn = np.empty_like(order)
+    turn[order] = np.arange(len(order)) - starts.repeat(np.diff(starts, append=len(order)))
+    return turn
+
+
+def _without_more_copies(points: Floats, most: int) -> Ints | None:
+    """Rows of points (n, 2) without the copies of any beyond ``most``; None if they may stay."""
+    place = places(points)
+    return None if place is None else np.flatnonzero(turns(place) < most)
 
 
 def beyond_chance(contrast: Floats, n: int, n_among: int) -> bool:

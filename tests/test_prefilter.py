@@ -90,6 +90,28 @@ def test_contrast_is_the_definition_where_two_matches_share_a_point(columns, als
     )
 
 
+@pytest.mark.parametrize("columns", [slice(0, 2), slice(2, 4)])
+def test_copies_of_a_point_beyond_the_neighbours_looked_at_are_not_searched(columns, monkeypatch):
+    """What is far from them has the same contrast all the same."""
+    X = two_view_scene(300, inlier_ratio=1.0, random_state=0).X
+    copies = np.random.default_rng(0).uniform(0, 900, (600, 4))
+    copies[:, columns] = 5000.0
+    X = np.vstack([copies, X])
+    sizes = []
+    index = _prefilter.cv2.flann.Index
+
+    def spy(points, params):
+        sizes.append(len(points))
+        return index(points, params)
+
+    monkeypatch.setattr(_prefilter.cv2.flann, "Index", spy)
+    contrast = density_contrast(X)
+    assert sorted(sizes) == [300 + 17, 900]
+    monkeypatch.setattr(_prefilter, "places", lambda points: None)
+    np.testing.assert_array_equal(density_contrast(X)[600:], contrast[600:])
+    assert sizes[2:] == [900, 900]
+
+
 def test_contrast_does_not_depend_on_how_the_work_is_cut(monkeypatch):
     X = scene_of(1, 100).X
     whole = density_contrast(X)
