@@ -21,7 +21,7 @@ from cv_densityf._epipolar import (
     shift,
 )
 from cv_densityf._parallax import FEWEST, plane_and_parallax
-from cv_densityf._prefilter import COHERENT, coherence, places, turns
+from cv_densityf._prefilter import COHERENT, coherence, place_numbers, turns
 from cv_densityf._stopwatch import Stopwatch
 
 Floats = NDArray[np.floating]
@@ -89,16 +89,16 @@ _LOCAL_STEPS = 3
 #: samples, and of the best ones, which are polished.
 _LOCAL_SIGMAS = 2.5
 _LOCAL_SAMPLES = (24, 8)
-#: Threshold of a draw for what most matches agree on, in these standard deviations, and how many
-#: near matches it is from.
-_MAJORITY_SIGMAS = 1.2
-_MAJORITY_OF = 300
 #: Before that, where no draws agree, the right F may be next to another hypothesis than the best:
 #: the same numbers at the working threshold from each of so many, whose inliers have less than this
 #: intersection over union.
 _LOCAL_SAMPLES_IN_DOUBT = (96, 16)
 _LOCAL_STARTS_IN_DOUBT = 2
 _SAME_BASIN = 0.8
+#: Threshold of a draw for what most matches agree on, in standard deviations, and how many
+#: near matches it is from.
+_MAJORITY_SIGMAS = 1.2
+_MAJORITY_OF = 300
 #: Widths of the vote, in units of the working threshold.
 _VOTE_WIDTHS = np.array([0.3, 0.5, 0.8, 1.3])
 #: Votes saturate within a cell of this many to the longer side of each image.
@@ -455,7 +455,7 @@ class _Pool:
         return _noise(self._squared[self.best, self._reliable], self.threshold)
 
     def spread(self, order: Ints) -> Ints:
-        """Places in an order, most reliable first, of half of its matches, in turn of all cells."""
+        """Places in an order of reliability of half of its matches, in turn from each cell."""
         top = order[: max(MIN_DRAW, int(_SPREAD_OF * len(order)))]
         turn = turns(self._ballot.cells[0, top])
         return np.argsort(turn, kind="stable")[: max(MIN_DRAW, len(order) // 2)]
@@ -643,7 +643,7 @@ def _claimants(X: Floats) -> Floats:
     """
     total = np.ones(len(X))
     for points in (X[:, :2], X[:, 2:]):
-        place = places(points)
+        place = place_numbers(points)
         if place is not None:
             total = np.maximum(total, np.bincount(place)[place])
     return total

@@ -109,7 +109,7 @@ def density_contrast(
     return contrast
 
 
-def places(points: Floats) -> Ints | None:
+def place_numbers(points: Floats) -> Ints | None:
     """Give points (n, 2) the number of their place; None if no place has a tenth of them."""
     n = len(points)
     x = np.sort(points[:, 0])
@@ -133,7 +133,7 @@ def turns(labels: NDArray[np.integer]) -> Ints:
 
 def _without_more_copies(points: Floats, most: int) -> Ints | None:
     """Rows of points (n, 2) without the copies of any beyond ``most``; None if they may stay."""
-    place = places(points)
+    place = place_numbers(points)
     return None if place is None else np.flatnonzero(turns(place) < most)
 
 

@@ -107,7 +107,7 @@ def test_copies_of_a_point_beyond_the_neighbours_looked_at_are_not_searched(colu
     monkeypatch.setattr(_prefilter.cv2.flann, "Index", spy)
     contrast = density_contrast(X)
     assert sorted(sizes) == [300 + 17, 900]
-    monkeypatch.setattr(_prefilter, "places", lambda points: None)
+    monkeypatch.setattr(_prefilter, "place_numbers", lambda points: None)
     np.testing.assert_array_equal(density_contrast(X)[600:], contrast[600:])
     assert sizes[2:] == [900, 900]
 
