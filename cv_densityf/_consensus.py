@@ -21,7 +21,7 @@ from cv_densityf._epipolar import (
     shift,
 )
 from cv_densityf._parallax import FEWEST, plane_and_parallax
-from cv_densityf._prefilter import COHERENT, coherence, place_numbers, turns
+from cv_densityf._prefilter import COHERENT, coherence, grouped, place_numbers, turns
 from cv_densityf._stopwatch import Stopwatch
 
 Floats = NDArray[np.floating]
@@ -236,9 +236,7 @@ def search(
     drawn = None
     if majority:
         watch.lap("polish")
-        some = np.flatnonzero(pool.near_best(_NEAR_WIDTH))
-        if len(some) > _MAJORITY_OF:
-            some = rng.choice(some, _MAJORITY_OF, replace=False, shuffle=False)
+        some = _at_most(_MAJORITY_OF, np.flatnonzero(pool.near_best(_NEAR_WIDTH)), rng)
         drawn = draw(
             X[some].astype(np.float32),
             max(_MAJORITY_SIGMAS * pool.noise, _NARROWEST * threshold),
@@ -502,9 +500,8 @@ class _Pool:
         optimized RANSAC" (2003), with the vote as its score. The matches it is not far from polish
         and vote, some of many.
         """
-        rows = np.flatnonzero(squared < (_LOCAL_REACH * width) ** 2)
-        if len(rows) > _LOCAL_MATCHES:
-            rows = self._rng.choice(rows, _LOCAL_MATCHES, replace=False, shuffle=False)
+        reached = np.flatnonzero(squared < (_LOCAL_REACH * width) ** 2)
+        rows = _at_most(_LOCAL_MATCHES, reached, self._rng)
         near = squared[rows] < (_LOCAL_WIDTH * width) ** 2
         size = min(_LOCAL_SIZE, int(np.count_nonzero(near)) // 2)
         if size < 8:
@@ -629,6 +626,11 @@ class _Pool:
         return wider.refined(entered[wider.best])
 
 
+def _at_most(size: int, rows: Ints, rng: np.random.Generator) -> Ints:
+    """Draw ``size`` of the rows, or take all of fewer."""
+    return rows if len(rows) <= size else rng.choice(rows, size, replace=False, shuffle=False)
+
+
 def _alike(inliers: Floats, one: Floats, overlap: float) -> Bools:
     """Which of some inlier sets (m, n) agree with another one (n,)."""
     common = inliers @ one
@@ -737,8 +739,5 @@ def _cells(points: Floats) -> NDArray[np.uint16]:
 
 def _groups(cells: NDArray[np.uint16]) -> tuple[Ints, Ints]:
     """Rows sorted by cell, and where each starts; of k grids (k, n) without a number in common."""
-    flat = cells.ravel()
-    order = np.argsort(flat, kind="stable")
-    flat = flat[order]
-    starts = np.flatnonzero(np.concatenate([[True], flat[1:] != flat[:-1]]))
+    order, starts = grouped(cells.ravel())
     return order % cells.shape[1], starts

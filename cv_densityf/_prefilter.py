@@ -121,11 +121,16 @@ def place_numbers(points: Floats) -> Ints | None:
     return np.asarray(number.ravel())
 
 
+def grouped(labels: NDArray[np.integer]) -> tuple[Ints, Ints]:
+    """Places (n,) sorted by label, and where in this order each label starts."""
+    order = np.argsort(labels, kind="stable")
+    labels = labels[order]
+    return order, np.flatnonzero(np.concatenate([[True], labels[1:] != labels[:-1]]))
+
+
 def turns(labels: NDArray[np.integer]) -> Ints:
     """How many before each one have the same label, (n,)."""
-    order = np.argsort(labels, kind="stable")
-    ordered = labels[order]
-    starts = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+    order, starts = grouped(labels)
     turn = np.empty_like(order)
     turn[order] = np.arange(len(order)) - starts.repeat(np.diff(starts, append=len(order)))
     return turn
