@@ -95,7 +95,7 @@ def density_contrast(
         )
         # Long rows are compared faster.
         columns1, columns2 = (
-            np.ascontiguousarray(near.T) if some is None else some[near.T]
+            np.ascontiguousarray(near.T) if some is None else some[near.T.astype(np.intp)]
             for near, some in zip((near1, near2), members, strict=True)
         )
         shared = np.flatnonzero(columns1[:, None] == columns2)

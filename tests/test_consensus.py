@@ -711,7 +711,7 @@ def test_the_unit_of_length_does_not_matter_to_what_is_made_of_the_draws(factor,
         here = find(X[:300], reliability, threshold=3.0, others=others)
         scaled = None if others is None else factor * others
         there = find(factor * X[:300], reliability, threshold=3.0 * factor, others=scaled)
-        np.testing.assert_allclose(there.votes, here.votes, rtol=1e-9)
+        np.testing.assert_allclose(there.votes, here.votes, rtol=1e-6)
         back = zoom @ there.F @ zoom
         np.testing.assert_allclose(
             back / np.linalg.norm(back), here.F / np.linalg.norm(here.F), rtol=1e-6
