@@ -107,7 +107,8 @@ _GRID = 16
 _POLISH_WIDTH = 0.7
 _POLISH_STEPS = 2
 _REFINE_STEPS = 2
-#: The noise that the last steps reckon with, at least, in units of the threshold.
+#: The noise that what follows the choice of the winner reckons with, at least, in units of the
+#: threshold.
 _NARROWEST = 0.03
 #: For the last steps, right matches are counted within so many sigmas of their lines, wrong ones
 #: between these, in each of so many groups of like reliability; and the density of right ones on
@@ -164,13 +165,14 @@ def search(
 ) -> Consensus | None:
     """Search for the fundamental matrix that the reliable and well spread matches vote for.
 
-    Rounds of draws on nested sets of the most reliable matches, on all that are ranked, and on what
-    the best hypothesis so far leaves near its epipolar lines: a nearly right F has the right one's
-    inliers there. Each hypothesis is polished on all matches. The draws end when a second,
-    independent one arrives at the best hypothesis's inliers, and one from what these leave, if that
-    is much, is no better; or after `ROUNDS` on each ranking, or where there is no hope. Where most
-    inliers are on a plane, other hypotheses of that plane are then tried. Where no draws agree, the
-    best hypotheses are optimised locally; the winner always is, within its noise.
+    Rounds of draws on nested sets of the most reliable matches, on some that are spread over the
+    image, on all that are ranked, and on what the best hypothesis so far leaves near its epipolar
+    lines: a nearly right F has the right one's inliers there. Each hypothesis is polished on all
+    matches. The draws end when a second, independent one arrives at the best hypothesis's inliers,
+    and one from what these leave, if that is much, is no better; or after `ROUNDS` on each ranking,
+    or where there is no hope. Where most inliers are on a plane, other hypotheses of that plane are
+    then tried. Where no draws agree, and there is hope, the best hypotheses are optimised locally;
+    the winner always is, within its noise.
 
     Parameters
     ----------
@@ -248,6 +250,8 @@ def search(
         watch.lap("draws")
     G = pool.optimised_best(drawn)
     F = pool.refined(G) if others is None else pool.settled_by(others - centre, G)
+    # On its way it may have gone over to matches that no other draw has seen.
+    agreed = agreed and pool.best_has_inliers_of(F)
     F = shift(-centre[2:]).T @ F @ shift(-centre[:2])
     watch.lap("polish")
     again = "found again by another" if agreed else "found by no other"
@@ -402,7 +406,7 @@ class _Pool:
         G = polish(self._frame, self._frame.enter(F), [_POLISH_WIDTH * self.working])
         squared = self._frame.sampson(G)
         best = self._ballot.count(squared, self.working).argmax()
-        scale = _SIGMAS * _noise(squared[best, self._reliable], self.threshold)
+        scale = _SIGMAS * self._noise_of(squared[best])
         self.working = max(min(scale, self.threshold), _SMALLEST_SCALE * self.threshold)
         self._join(G, sizes)
 
@@ -450,7 +454,10 @@ class _Pool:
     @property
     def noise(self) -> float:
         """Robust standard deviation of the best hypothesis's residuals, pixels."""
-        return _noise(self._squared[self.best, self._reliable], self.threshold)
+        return self._noise_of(self._squared[self.best])
+
+    def _noise_of(self, squared: Floats) -> float:
+        return _noise(squared[self._reliable], self.threshold)
 
     def spread(self, order: Ints) -> Ints:
         """Places in an order of reliability of half of its matches, in turn from each cell."""
@@ -480,10 +487,12 @@ class _Pool:
     def optimise(self) -> None:
         """Optimise the best hypotheses locally; what comes of them joins."""
         for start in self._finalists(_LOCAL_STARTS_IN_DOUBT, _SAME_BASIN):
+            before = self._G[start]
             G = self._optimised(
-                self._G[start], self._squared[start], self.working, *_LOCAL_SAMPLES_IN_DOUBT
+                before, self._squared[start], self.working, *_LOCAL_SAMPLES_IN_DOUBT
             )
-            self._append(G[None], *self._poll(G[None]), [0])
+            if G is not before:
+                self._append(G[None], *self._poll(G[None]), [0])
 
     def _optimised(
         self,
@@ -498,7 +507,7 @@ class _Pool:
 
         Or one of the ``others`` (m, 3, 3). The inner sampling of Chum, Matas and Kittler, "Locally
         optimized RANSAC" (2003), with the vote as its score. The matches it is not far from polish
-        and vote, some of many.
+        and vote, some of many. Where two samples of eight are not near, the same matrix comes back.
         """
         reached = np.flatnonzero(squared < (_LOCAL_REACH * width) ** 2)
         rows = _at_most(_LOCAL_MATCHES, reached, self._rng)
@@ -547,7 +556,6 @@ class _Pool:
 
     def agrees(
         self,
-        overlap: float = _AGREEMENT,
         among: Bools | None = None,
         independently: bool = False,
     ) -> bool:
@@ -555,10 +563,16 @@ class _Pool:
         if len(self) < 2:
             return False
         inliers = self._inliers if among is None else self._inliers[:, among]
-        alike = _alike(inliers, inliers[self.best], overlap)
+        alike = _alike(inliers, inliers[self.best], _AGREEMENT)
         sizes = self._sizes if independently else np.abs(self._sizes)
         sizes = sizes[alike & (sizes > 0)]
         return len(sizes) > 1 and bool(sizes.max() >= _DISTINCT * sizes.min())
+
+    def best_has_inliers_of(self, F: Floats) -> bool:
+        """Whether a matrix, in pixels, has the best hypothesis's inliers."""
+        squared = self._frame.sampson(self._frame.enter(F[None]))
+        inliers = (squared < self.working**2).astype(np.float32)
+        return bool(_alike(inliers, self._inliers[self.best], _AGREEMENT)[0])
 
     def optimised_best(self, drawn: Floats | None = None) -> Floats:
         """Optimise the best hypothesis at the width of its own residuals; (3, 3), in the frame.
@@ -580,14 +594,14 @@ class _Pool:
         if len(squared) > _MANY:
             G = self._settled(G, squared)
             squared = self._frame.sampson(G[None])[0]
-        noise = _noise(squared[self._reliable], self.threshold)
+        noise = self._noise_of(squared)
         sigma = max(noise, _NARROWEST * self.threshold)
         doubt = _doubt(squared, sigma, self._reliability)
         G = refine(self._frame, G, sigma, doubt, noise, _REFINE_STEPS)
         return np.ascontiguousarray(self._frame.leave(G[None])[0])
 
     def _settled(self, G: Floats, squared: Floats) -> Floats:
-        noise = _noise(squared[self._reliable], self.threshold)
+        noise = self._noise_of(squared)
         width = max(_STRIDE_SIGMAS * noise, _NARROWEST * self.threshold)
         end = step = G[None]
         for _ in range(_STRIDES):

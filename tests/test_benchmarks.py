@@ -12,6 +12,7 @@ from benchmarks.data import Pair, load_pairs, move_onto
 from benchmarks.lpm import MAX_COST, MIN_ALIKE, SIZES, locality_preserving_matches
 from benchmarks.run import Record
 from benchmarks.scenes import KINDS, make_scene
+from cv_densityf import coherence
 
 #: Rows match: x' on the same row as x.
 RECTIFIED = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -285,6 +286,14 @@ class TestScenes:
         H, mask = cv2.findHomography(wrong[:, :2], wrong[:, 2:], cv2.USAC_ACCURATE, 0.01)
         assert H is not None
         assert np.count_nonzero(mask) >= 0.9 * 225
+
+    def test_what_moves_are_crowds_that_keep_their_neighbours(self):
+        scene = make_scene("moving_objects", 1000, 0.5, 0.0)
+        wrong = scene.X[metrics.sampson_distance(scene.F_gt, scene.X) > 5]
+        scattered = make_scene("clusters", 1000, 0.5, 0.0)
+        by_chance = scattered.X[metrics.sampson_distance(scattered.F_gt, scattered.X) > 5]
+        assert coherence(wrong[:, :2], wrong[:, 2:]) > 0.5
+        assert coherence(by_chance[:, :2], by_chance[:, 2:]) < 0.05
 
     def test_noise_is_what_was_asked(self):
         exact, noisy = (make_scene("clusters", 2000, 1.0, noise) for noise in (0.0, 0.7))

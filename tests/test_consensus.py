@@ -17,6 +17,7 @@ from cv_densityf._epipolar import (
     Frame,
     eight_point,
     essential_ratio,
+    middle,
     polish,
     sampson_distance,
     shift,
@@ -283,6 +284,15 @@ def test_of_the_samples_the_best_are_polished(monkeypatch, seed):
     assert np.min(chosen) > np.median(all_)
 
 
+def test_with_too_few_near_matches_to_optimise_nothing_joins():
+    """A hypothesis would be there twice, and its vote."""
+    X = true_matches(0, n=15)
+    pool = _Pool(X, np.ones(15), np.arange(15), 1.0, np.random.default_rng(0))
+    pool.add(eight_point(X[None]), [15])
+    pool.optimise()
+    assert len(pool) == 1
+
+
 def test_rivals_of_other_inliers_are_optimised(monkeypatch):
     sizes_of = zip((0, 50, 100, 150), (250, 150, 99, 60), strict=True)
     motions = [true_matches(seed, n=n) for seed, n in sizes_of]
@@ -352,8 +362,66 @@ def test_what_most_agree_on_gets_a_draw_at_its_noise(monkeypatch):
     assert find(X, threshold=4.0, majority=True).n_draws == len(draws) - n == n + 1
     points, threshold, iters, _ = draws[-1]
     assert len(points) == 300
+    # They are near its lines, not any; a fifth of all are wrong.
+    points = points + middle(X)[0]
+    assert sampson_distance(scene_of(0).F, points).max() < 1.1 * _consensus._NEAR_WIDTH * 4.0
     assert threshold < 0.25
     assert iters < draws[0][2]
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-9])
+def test_no_noise_is_still_some(noise, monkeypatch):
+    """Widths of nothing would leave nothing within them, and cv2's draws nothing to find."""
+    X = scene_of(0, noise=noise, inlier_ratio=0.8).X
+    draws = spied_draws(monkeypatch, _engine.draw)
+    widths = []
+    optimised = _Pool._optimised
+
+    def spy(pool, G, squared, width, *rest):
+        widths.append(width)
+        return optimised(pool, G, squared, width, *rest)
+
+    monkeypatch.setattr(_Pool, "_optimised", spy)
+    found = find(X, threshold=4.0, majority=True)
+    assert draws[-1][1] > 0.1
+    assert widths[-1] > 0.1
+    assert sampson_distance(found.F, true_matches(0)).max() < 1e-4
+
+
+def test_what_the_winner_becomes_is_agreed_on_only_where_it_keeps_its_inliers(monkeypatch):
+    X = scene_of(0).X
+    found = find(X)
+    assert found.agreed
+    assert found.reason.endswith("found again by another")
+    centre = middle(X)[0]
+    another = shift(centre[2:]).T @ scene_of(1).F @ shift(centre[:2])
+    monkeypatch.setattr(
+        _Pool, "optimised_best", lambda pool, drawn: pool._frame.enter(another[None])[0]
+    )
+    for others in (None, true_matches(1)):
+        found = find(X, others=others)
+        assert not found.agreed
+        assert found.reason.endswith("found by no other")
+
+
+def test_what_is_optimised_is_what_more_matches_settle_on(monkeypatch):
+    made, given = [], []
+    optimised_best, settled_by = _Pool.optimised_best, _Pool.settled_by
+
+    def optimise(pool, drawn):
+        made.append(optimised_best(pool, drawn))
+        return made[0]
+
+    def settle(pool, others, G):
+        given.append(G)
+        return settled_by(pool, others, G)
+
+    monkeypatch.setattr(_Pool, "optimised_best", optimise)
+    monkeypatch.setattr(_Pool, "settled_by", settle)
+    X = scene_of(0).X
+    find(X[:300], others=X[300:])
+    assert len(given) == 1
+    assert given[0] is made[0]
 
 
 def test_what_is_unreliable_may_stay_unexplained(monkeypatch):
@@ -383,7 +451,7 @@ def test_two_different_answers_are_no_agreement(monkeypatch):
     X = scene_of(0).X
     answers = iter(np.random.default_rng(0).normal(size=(99, 3, 3)) * [1e-6, 1e-6, 1e-3])
     monkeypatch.setattr(_consensus, "draw", lambda *_, **__: next(answers))
-    monkeypatch.setattr(_Pool, "_optimised", lambda pool, G, *_: G)
+    monkeypatch.setattr(_Pool, "_optimised", lambda pool, G, *_: G.copy())
     monkeypatch.setattr(_consensus, "polish", lambda frame, G, scales: G)
     found = find(X)
     assert found.n_draws >= 2 * len(_consensus.ROUNDS) - 1
@@ -400,7 +468,7 @@ def test_where_all_lies_together_only_as_by_chance_the_search_ends_early(monkeyp
     found = find(wrong, together=False)
     assert found.n_draws == len(draws) == 4
     assert found.reason.endswith("lie together only as by chance, and so do the inliers")
-    # Nor is there anything to optimise.
+    # Nor are there rivals to optimise.
     assert not optimised
     # Not where one of both does: the matches,
     assert find(wrong).n_draws > 4
@@ -852,7 +920,7 @@ def test_finalists_are_the_best_three_of_different_inliers(seed, monkeypatch):
         (100, 0, [50, 0], False),
     ],
 )
-def test_agreement_is_of_inliers_from_parts_of_other_sizes(common, more, sizes, agree):
+def test_agreement_is_of_inliers_from_parts_of_other_sizes(common, more, sizes, agree, monkeypatch):
     """Of two sets of 100 and of ``common`` and ``more``, by what they share of their union."""
     X = scene_of(0, n=300).X
     pool = _Pool(X, np.ones(300), np.arange(300), 3.0, np.random.default_rng(0))
@@ -863,8 +931,10 @@ def test_agreement_is_of_inliers_from_parts_of_other_sizes(common, more, sizes, 
     assert pool.agrees() == agree
     overlap = common / (100 + more)
     if agree:
-        assert pool.agrees(overlap - 0.001)
-    assert not pool.agrees(overlap + 0.001)
+        monkeypatch.setattr(_consensus, "_AGREEMENT", overlap - 0.001)
+        assert pool.agrees()
+    monkeypatch.setattr(_consensus, "_AGREEMENT", overlap + 0.001)
+    assert not pool.agrees()
 
 
 def test_the_next_ranking_is_asked_for_where_no_two_draws_agree(monkeypatch):

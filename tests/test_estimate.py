@@ -873,6 +873,15 @@ def test_the_searchs_threshold_is_a_hundredth_of_the_spread_near_the_callers(
         assert _estimate._search_threshold(300.0, n, robust, "paper") == threshold
 
 
+def test_only_lmeds_draws_for_what_most_agree_on():
+    scene = two_view_scene(400, inlier_ratio=0.8, noise=0.3, random_state=0)
+    draws = {
+        method: estimate_fundamental(scene.points1, scene.points2, method=method).n_draws
+        for method in ("lmeds", "ransac", "usac_accurate", "usac_prosac")
+    }
+    assert draws == {"lmeds": 3, "ransac": 2, "usac_accurate": 2, "usac_prosac": 2}
+
+
 @pytest.mark.parametrize("method", ["lmeds", "usac_accurate"])
 def test_objects_that_move_on_their_own_pull_less_than_in_cv2(method):
     """Three in five of the wrong matches suit some F that is nearly right."""

@@ -12,6 +12,7 @@ from cv_densityf._prefilter import (
     beyond_chance,
     contrast_support,
     density_contrast,
+    place_numbers,
     ranks,
 )
 from cv_densityf.datasets import two_view_scene
@@ -110,6 +111,20 @@ def test_copies_of_a_point_beyond_the_neighbours_looked_at_are_not_searched(colu
     monkeypatch.setattr(_prefilter, "place_numbers", lambda points: None)
     np.testing.assert_array_equal(density_contrast(X)[600:], contrast[600:])
     assert sizes[2:] == [900, 900]
+
+
+def test_a_place_is_where_both_coordinates_are_the_same():
+    """Points that share one, as at the border that an image was cut at, are at many places."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, 900, (200, 2))
+    points[:100, 0] = 0.0
+    points[50:150, 1] = 7.0
+    number = place_numbers(points)
+    np.testing.assert_array_equal(
+        number[:, None] == number, (points[:, None] == points).all(axis=2)
+    )
+    assert np.count_nonzero(number == number[60]) == 50
+    assert place_numbers(points[100:]) is None
 
 
 def test_contrast_does_not_depend_on_how_the_work_is_cut(monkeypatch):
