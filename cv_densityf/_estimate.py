@@ -77,8 +77,8 @@ class Estimate:
     n_draws : int
         Hypotheses drawn; 0 if cv2's own call answered.
     agreed : bool
-        Whether another draw found the same, which is hardly ever by accident. False where nearly
-        all inliers are on one plane, which leaves F open, where cv2's own call answered, and for
+        Whether another draw found the same inliers, which is hardly ever by accident. False where
+        nearly all are on one plane, which leaves F open, where cv2's own call answered, and for
         ``density="paper"``.
     engine : str
         What drew: ``"density"``, or the name of cv2's method that was called instead.
@@ -88,8 +88,9 @@ class Estimate:
         Milliseconds per stage.
     votes : tuple of float
         The vote for each polished hypothesis of the last search, in the order of the draws; then
-        for those of a dominant plane and of the local optimisation, where there were any.
-        Of many matches, those of the part that searched. Where a plane is dominant, the winner's
+        for those of a dominant plane and, where no draws agreed, of the local optimisation. What
+        the best of them becomes after that has none, nor has the draw that only ``"lmeds"`` makes.
+        Of many matches, those of the part that searched. Where a plane is dominant, the best one's
         may be 3 % less than the largest: among these the number of inliers off the plane decides.
 
     See Also
@@ -233,7 +234,9 @@ def _estimate(
     reason = found.reason
     if robust.rule != "lmeds" and robust.threshold > _COARSE * about[1]:
         share = robust.threshold / about[1]
-        reason += f"; the threshold is {share:.2g} of the points' spread: are they in pixels?"
+        reason = (
+            f"the threshold is {share:.2g} of the points' spread (are they in pixels?); {reason}"
+        )
     return Estimate(
         F=F,
         mask=mask,

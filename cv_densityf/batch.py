@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cv_densityf._estimate import Estimate, estimate_fundamental
+from cv_densityf.matching import Matches
 
-Pair = Sequence[ArrayLike]
+Pair = Sequence[ArrayLike] | Matches
 
 
 def estimate_many(
@@ -32,9 +33,9 @@ def estimate_many(
 
     Parameters
     ----------
-    pairs : iterable of (points1, points2) or (points1, points2, scores)
-        What `estimate_fundamental` takes, pixels. Read as results are wanted, a little ahead, so a
-        generator that loads pairs keeps memory small.
+    pairs : iterable of (points1, points2), (points1, points2, scores) or `Matches`
+        What `estimate_fundamental` takes, pixels; `Matches` are taken with their scores. Read as
+        results are wanted, a little ahead, so a generator that loads pairs keeps memory small.
     n_jobs : int, optional
         Pairs at a time; -1 for one per core. By default what ``joblib.parallel_config`` says, else
         1.
@@ -206,6 +207,8 @@ def _refuse() -> None:
 def _one(pair: Pair, options: dict[str, Any]) -> Estimate:
     """Estimate one pair; whatever goes wrong is its own result."""
     try:
+        if isinstance(pair, Matches):
+            pair = (pair.points1, pair.points2, pair.scores)
         items = tuple(pair) if isinstance(pair, Iterable) else None
         if items is None or not 2 <= len(items) <= 3:
             given = type(pair).__name__ if items is None else f"{len(items)} items"
@@ -238,7 +241,7 @@ def _alone(pair: Pair, options: dict[str, Any]) -> Estimate:
 
 def _failure(pair: Pair, reason: str) -> Estimate:
     try:
-        n = len(pair[0])  # type: ignore[arg-type]
+        n = len(pair if isinstance(pair, Matches) else pair[0])  # type: ignore[arg-type]
     except Exception:
         n = 0
     return Estimate(

@@ -16,6 +16,7 @@ import pytest
 from cv_densityf import estimate_fundamental
 from cv_densityf.batch import estimate_many, progress_bar
 from cv_densityf.datasets import two_view_scene
+from cv_densityf.matching import Matches
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +75,16 @@ def test_scores_belong_to_the_pair(pairs):
     assert not np.array_equal(found.kept, estimate_fundamental(points1, points2).kept)
     with pytest.raises(TypeError, match="scores belong to a pair"):
         estimate_many(pairs, scores=scores)
+
+
+def test_what_match_images_returns_is_a_pair(pairs):
+    points1, points2 = pairs[0]
+    scores = np.random.default_rng(0).random(len(points1))
+    (found,) = estimate_many([Matches(points1, points2, scores, (640, 480), (640, 480))])
+    assert same(found, estimate_fundamental(points1, points2, scores=scores))
+    (failed,) = estimate_many([Matches(points1, points2[1:], scores, (640, 480), (640, 480))])
+    assert not failed
+    assert len(failed.mask) == len(points1)
 
 
 @pytest.mark.parametrize("n_jobs", [1, 2])
