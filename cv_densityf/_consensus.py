@@ -83,7 +83,7 @@ _DISTINCT = 1.4
 _LOCAL_SIZE = 10
 _LOCAL_WIDTH = 3.0
 _LOCAL_REACH = 20.0
-_LOCAL_MATCHES = 1_000
+_LOCAL_MATCHES = 500
 _LOCAL_STEPS = 3
 #: Of the winner it is at a width of so many robust standard deviations of the residuals. Number of
 #: samples, and of the best ones, which are polished.

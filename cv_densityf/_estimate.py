@@ -36,9 +36,10 @@ MIN_FILTERED = 15
 MAX_SEARCHED = 5_000
 #: They do help to choose and to measure it, up to what memory should bear.
 MAX_REFINED = 100_000
-#: Of as many of those that search the density is looked at, and hypotheses are drawn; of all where
-#: no two of these agree.
+#: Of as many of those that search the density is looked at, and hypotheses are drawn; of so few
+#: where most of these are right; and of all where no two hypotheses agree.
 MAX_RANKED = 1_000
+FEW_RANKED = 250
 #: The noise is the data's, and the caller's threshold rules the mask: the search has this part of
 #: the points' spread for its threshold, 1 to 3 px in a photograph, as far as it is within this
 #: factor of the caller's; below half of it, right matches may not agree any more. Few matches get
@@ -69,8 +70,8 @@ class Estimate:
         Inliers by the method's own rule.
     kept : array, shape (n,), bool
         The dense part: matches the density rule holds reliable. Of more than a thousand it looks at
-        a thousand, and at all where these lead to no agreement. Where cv2's own call answered, all
-        finite matches.
+        a thousand, or 250 if most of these are right, and at all where they lead to no agreement.
+        Where cv2's own call answered, all finite matches.
     reliability : array, shape (n,), float64
         From 0 (isolated) to 1 (densest); NaN for matches whose density was not looked at. Where
         cv2's own call answered, 1 for finite matches and 0 for others.
@@ -271,8 +272,11 @@ def _rankings(
     n = len(X)
     if n > MAX_RANKED:
         better = np.arange(n) if trust is None else best_scored(trust, max(n // 2, MAX_RANKED))
-        rows = better[_some(len(better), MAX_RANKED, np.random.default_rng(abs(seed)))]
-        reliability, _, together = contrast_support(X, trust, rows)
+        rng = np.random.default_rng(abs(seed))
+        rows = better[_some(len(better), MAX_RANKED, rng)]
+        few = _some(len(rows), FEW_RANKED, rng)
+        rows = np.concatenate([rows[few], np.delete(rows, few)])
+        reliability, _, together = contrast_support(X, trust, rows, FEW_RANKED)
         watch.lap("density")
         yield reliability, together
     reliability, _, together = contrast_support(X, trust)

@@ -22,7 +22,7 @@ from cv_densityf import (
     findFundamentalMat,
 )
 from cv_densityf._arguments import OFF
-from cv_densityf._consensus import search
+from cv_densityf._consensus import _Pool, search
 from cv_densityf._engine import METHODS, Robust, original
 from cv_densityf._epipolar import eight_point, inlier_mask, middle, sampson_distance
 from cv_densityf._estimate import MIN_FILTERED, _some, run
@@ -472,6 +472,22 @@ def test_a_searched_part_is_told_by_the_reliability():
     assert result.mask[unseen & scene.inliers].mean() > 0.5
     other = estimate(scene.X, random_state=1)
     assert not np.array_equal(unseen, np.isnan(other.reliability))
+
+
+def test_of_many_matches_few_are_looked_at_where_most_are_right(monkeypatch):
+    scene = scene_of(0, 3_000, 0.8)
+    rows = [
+        np.flatnonzero(~np.isnan(estimate(scene.X, random_state=seed).reliability))
+        for seed in (0, 0, 1)
+    ]
+    assert [len(r) for r in rows] == [250] * 3
+    assert np.array_equal(rows[0], rows[1])
+    assert not np.array_equal(rows[0], rows[2])
+    # They are of all, not of those that come first.
+    assert rows[0].min() < 200 < 2_800 < rows[0].max()
+    assert sampson_distance(estimate(scene.X).F, true_matches(0)).mean() < 0.1
+    monkeypatch.setattr(_Pool, "agrees", lambda *_, **__: False)
+    assert not np.isnan(estimate(scene.X).reliability).any()
 
 
 @pytest.mark.parametrize(("n", "n_better"), [(1_200, 1_000), (4_000, 2_000)])

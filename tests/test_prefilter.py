@@ -8,6 +8,7 @@ from scipy.stats import rankdata
 
 from cv_densityf import _prefilter
 from cv_densityf._prefilter import (
+    CLEAN,
     best_scored,
     beyond_chance,
     contrast_support,
@@ -111,6 +112,27 @@ def test_copies_of_a_point_beyond_the_neighbours_looked_at_are_not_searched(colu
     monkeypatch.setattr(_prefilter, "place_numbers", lambda points: None)
     np.testing.assert_array_equal(density_contrast(X)[600:], contrast[600:])
     assert sizes[2:] == [900, 900]
+
+
+@pytest.mark.parametrize(("inlier_ratio", "looked_at"), [(0.8, 100), (0.3, 600)])
+def test_where_most_are_right_few_tell(inlier_ratio, looked_at):
+    X = scene_of(0, 600, inlier_ratio).X
+    rows = np.random.default_rng(0).permutation(600)
+    expected = density_contrast(X)[rows]
+    assert (expected[:100].mean() > CLEAN) == (looked_at == 100)
+    np.testing.assert_array_equal(density_contrast(X, rows, few=100), expected[:looked_at])
+    reliability, kept, _ = contrast_support(X, rows=rows, few=100)
+    seen = rows[:looked_at]
+    np.testing.assert_array_equal(reliability[seen], ranks(expected[:looked_at]))
+    assert np.isnan(np.delete(reliability, seen)).all()
+    assert not np.delete(kept, seen).any()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_contrast_by_which_few_tell_is_that_of_right_ones(seed):
+    for inlier_ratio in (0.1, 0.3, 0.5):
+        assert density_contrast(scene_of(seed, 600, inlier_ratio).X).mean() < CLEAN
+    assert density_contrast(scene_of(seed, 600, 0.75).X).mean() > CLEAN
 
 
 def test_a_place_is_where_both_coordinates_are_the_same():
