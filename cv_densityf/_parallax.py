@@ -84,7 +84,11 @@ def plane_and_parallax(
     with np.errstate(invalid="ignore"):
         hypotheses /= np.linalg.norm(hypotheses, axis=(1, 2), keepdims=True)
     judges = rng.permutation(np.flatnonzero(off_plane))[:_JUDGES]
-    squared = frame.part(judges).sampson(hypotheses)
-    votes = np.maximum(0.0, 1.0 - squared / width**2).sum(axis=1)
+    jury = frame.part(judges)
+    # So few at a time that their residuals stay in the cache.
+    tried = (jury.sampson(some) for some in np.split(hypotheses, _PAIRS // _JUDGES))
+    votes = np.concatenate(
+        [np.maximum(0.0, 1.0 - squared / width**2).sum(axis=1) for squared in tried]
+    )
     best = np.argsort(-votes, kind="stable")[:_BEST]
     return hypotheses[best[votes[best] > 0]], off_plane  # copies of one match fix no F
