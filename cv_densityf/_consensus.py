@@ -83,7 +83,7 @@ _DISTINCT = 1.4
 _LOCAL_SIZE = 10
 _LOCAL_WIDTH = 3.0
 _LOCAL_REACH = 20.0
-_LOCAL_MATCHES = 500
+_LOCAL_MATCHES = 1_000
 _LOCAL_STEPS = 3
 #: Of the winner it is at a width of so many robust standard deviations of the residuals. Number of
 #: samples, and of the best ones, which are polished.
@@ -507,17 +507,10 @@ class _Pool:
 
         Or one of the ``others`` (m, 3, 3). The inner sampling of Chum, Matas and Kittler, "Locally
         optimized RANSAC" (2003), with the vote as its score. The matches it is not far from polish
-        and vote, some of many; with a dominant plane, some of those on it and some of the others.
-        Where two samples of eight are not near, the same matrix comes back.
+        and vote, some of many. Where two samples of eight are not near, the same matrix comes back.
         """
         reached = np.flatnonzero(squared < (_LOCAL_REACH * width) ** 2)
-        if self._off_plane is None or len(reached) <= _LOCAL_MATCHES:
-            rows = _at_most(_LOCAL_MATCHES, reached, self._rng)
-        else:
-            # What fixes F is rare there, so it is chosen for itself.
-            off_plane = self._off_plane[reached]
-            parts = reached[off_plane], reached[~off_plane]
-            rows = np.concatenate([_at_most(_LOCAL_MATCHES, part, self._rng) for part in parts])
+        rows = _at_most(_LOCAL_MATCHES, reached, self._rng)
         near = squared[rows] < (_LOCAL_WIDTH * width) ** 2
         size = min(_LOCAL_SIZE, int(np.count_nonzero(near)) // 2)
         if size < 8:

@@ -255,7 +255,7 @@ def test_local_optimisation_of_many_looks_at_some(monkeypatch):
 
     monkeypatch.setattr(_consensus, "polish", spy)
     pool._optimised(pool._G[0], pool._squared[0], 1.0, 24, 8)
-    assert sizes == {500}
+    assert sizes == {1000}
 
 
 @pytest.mark.parametrize("seed", SEEDS)
