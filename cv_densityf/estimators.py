@@ -465,8 +465,8 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
     n_inliers_ : int
         Their number.
     candidate_mask_ : ndarray of bool, shape (n,)
-        Rows of fit in the dense part (of more than 1,000 rows, that of the 1,000 that were looked
-        at), or those that the prefilter kept.
+        Rows of fit in the dense part (of more than 1,000 rows, that of the 1,000 or 250 that were
+        looked at), or those that the prefilter kept.
     prefilter_ : estimator or None
         The fitted prefilter, None where ``prefilter`` is "auto" or None.
     threshold_ : float
