@@ -36,8 +36,8 @@ MIN_FILTERED = 15
 MAX_SEARCHED = 5_000
 #: They do help to choose and to measure it, up to what memory should bear.
 MAX_REFINED = 100_000
-#: Of as many of those that search the density is looked at, and hypotheses are drawn; of so few
-#: where most of these are right; and of all where no two hypotheses agree.
+#: Of as many of those that search the density is looked at, and hypotheses are drawn; without
+#: scores, of so few where most of these are right; and of all where no two hypotheses agree.
 MAX_RANKED = 1_000
 FEW_RANKED = 250
 #: The noise is the data's, and the caller's threshold rules the mask: the search has this part of
@@ -70,8 +70,8 @@ class Estimate:
         Inliers by the method's own rule.
     kept : array, shape (n,), bool
         The dense part: matches the density rule holds reliable. Of more than a thousand it looks at
-        a thousand, or 250 if most of these are right, and at all where they lead to no agreement.
-        Where cv2's own call answered, all finite matches.
+        a thousand, without scores at 250 if most of these are right, and at all where they lead to
+        no agreement. Where cv2's own call answered, all finite matches.
     reliability : array, shape (n,), float64
         From 0 (isolated) to 1 (densest); NaN for matches whose density was not looked at. Where
         cv2's own call answered, 1 for finite matches and 0 for others.
@@ -274,9 +274,12 @@ def _rankings(
         better = np.arange(n) if trust is None else best_scored(trust, max(n // 2, MAX_RANKED))
         rng = np.random.default_rng(abs(seed))
         rows = better[_some(len(better), MAX_RANKED, rng)]
-        few = _some(len(rows), FEW_RANKED, rng)
-        rows = np.concatenate([rows[few], np.delete(rows, few)])
-        reliability, _, together = contrast_support(X, trust, rows, FEW_RANKED)
+        few = None
+        if trust is None:  # the better half would not tell that most of all are right
+            few = FEW_RANKED
+            first = _some(len(rows), few, rng)
+            rows = np.concatenate([rows[first], np.delete(rows, first)])
+        reliability, _, together = contrast_support(X, trust, rows, few)
         watch.lap("density")
         yield reliability, together
     reliability, _, together = contrast_support(X, trust)

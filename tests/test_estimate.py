@@ -486,6 +486,9 @@ def test_of_many_matches_few_are_looked_at_where_most_are_right(monkeypatch):
     # They are of all, not of those that come first.
     assert rows[0].min() < 200 < 2_800 < rows[0].max()
     assert sampson_distance(estimate(scene.X).F, true_matches(0)).mean() < 0.1
+    # The better half by score would not tell.
+    with_scores = estimate(scene.X, scores=np.arange(3_000.0))
+    assert np.count_nonzero(np.isfinite(with_scores.reliability)) == 1_000
     monkeypatch.setattr(_Pool, "agrees", lambda *_, **__: False)
     assert not np.isnan(estimate(scene.X).reliability).any()
 
