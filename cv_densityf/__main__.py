@@ -707,7 +707,7 @@ def _run_demo(options: argparse.Namespace) -> int:
             f"{name:<26}{np.median(errors):>10.3f}{errors.max():>10.3f}"
             f"{np.median(inliers):>10.0f}{np.median(times):>20.1f}"
         )
-    found = estimate_fundamental(matches.points1, matches.points2)
+    found = estimate_fundamental(matches.points1, matches.points2, scores=matches.scores)
     if found.F is None:
         return _complain(f"no fundamental matrix found: {found.reason}", NOT_FOUND)
     F = found.F

@@ -33,7 +33,7 @@ def main(folder: Path) -> None:
     matches = match_images(pair.image1, pair.image2)
     X = matches.X
     right = sampson_distance(pair.F, X) < RIGHT
-    estimate = estimate_fundamental(matches.points1, matches.points2)
+    estimate = estimate_fundamental(matches.points1, matches.points2, scores=matches.scores)
     greys = [cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in (pair.image1, pair.image2)]
     print(
         f"{len(X)} matches, {right.sum()} right, {estimate.n_inliers} inliers, "

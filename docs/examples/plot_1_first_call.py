@@ -72,7 +72,7 @@ ax.legend(frameon=False, loc="lower right")
 # without cv2's shapes. Blue matches agree with the result; the light ones are outside the dense
 # part, in which the search began.
 
-estimate = cv_densityf.estimate_fundamental(points1, points2)
+estimate = cv_densityf.estimate_fundamental(points1, points2, scores=matches.scores)
 print(estimate.reason)
 
 fig, ax = plt.subplots(figsize=(12, 4.6), layout="constrained")
