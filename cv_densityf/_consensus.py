@@ -421,11 +421,13 @@ class _Pool:
     def _append(self, G: Floats, squared: Floats, votes: Floats, sizes: ArrayLike) -> None:
         self._G = np.concatenate([self._G, G])
         self._squared = np.concatenate([self._squared, squared])
-        inliers = (squared < self.working**2).astype(np.float32)
-        self._inliers = np.concatenate([self._inliers, inliers])
+        self._inliers = np.concatenate([self._inliers, self._inliers_by(squared)])
         self.votes = np.concatenate([self.votes, votes])
         self._sizes = np.concatenate([self._sizes, sizes])
         self.best = self._elected(self.votes, self._inliers)
+
+    def _inliers_by(self, squared: Floats) -> Floats:
+        return (squared < self.working**2).astype(np.float32)
 
     def _elected(self, votes: Floats, inliers: Floats, rows: Ints | slice = slice(None)) -> int:
         """Index of the most votes (m,), or of nearly as many and more inliers off a dominant plane.
@@ -570,8 +572,7 @@ class _Pool:
 
     def best_has_inliers_of(self, F: Floats) -> bool:
         """Whether a matrix, in pixels, has the best hypothesis's inliers."""
-        squared = self._frame.sampson(self._frame.enter(F[None]))
-        inliers = (squared < self.working**2).astype(np.float32)
+        inliers = self._inliers_by(self._frame.sampson(self._frame.enter(F[None])))
         return bool(_alike(inliers, self._inliers[self.best], _AGREEMENT)[0])
 
     def optimised_best(self, drawn: Floats | None = None) -> Floats:

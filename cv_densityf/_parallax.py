@@ -18,8 +18,10 @@ _STEPS = 3
 #: Pairs of matches tried, and how many of the hypotheses through them are worth a polish.
 _PAIRS = 512
 _BEST = 2
-#: Matches off the plane that are asked which these are.
+#: Matches off the plane that are asked which these are, and in how many parts, for the residuals of
+#: all pairs at once would not stay in the cache.
 _JUDGES = 128
+_PARTS = 4
 
 
 def plane_and_parallax(
@@ -85,10 +87,11 @@ def plane_and_parallax(
         hypotheses /= np.linalg.norm(hypotheses, axis=(1, 2), keepdims=True)
     judges = rng.permutation(np.flatnonzero(off_plane))[:_JUDGES]
     jury = frame.part(judges)
-    # So few at a time that their residuals stay in the cache.
-    tried = (jury.sampson(some) for some in np.split(hypotheses, _PAIRS // _JUDGES))
     votes = np.concatenate(
-        [np.maximum(0.0, 1.0 - squared / width**2).sum(axis=1) for squared in tried]
+        [
+            np.maximum(0.0, 1.0 - jury.sampson(part) / width**2).sum(axis=1)
+            for part in np.split(hypotheses, _PARTS)
+        ]
     )
     best = np.argsort(-votes, kind="stable")[:_BEST]
     return hypotheses[best[votes[best] > 0]], off_plane  # copies of one match fix no F

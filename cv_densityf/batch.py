@@ -18,11 +18,11 @@ from numpy.typing import ArrayLike
 from cv_densityf._estimate import Estimate, estimate_fundamental
 from cv_densityf.matching import Matches
 
-Pair = Sequence[ArrayLike] | Matches
+Pair = Sequence[ArrayLike]
 
 
 def estimate_many(
-    pairs: Iterable[Pair],
+    pairs: Iterable[Pair | Matches],
     *,
     n_jobs: int | None = None,
     backend: str | None = None,
@@ -87,8 +87,12 @@ def estimate_many(
     estimate_fundamental(np.empty((0, 2)), np.empty((0, 2)), **options)
     run = _runner(n_jobs, backend)
     total = len(pairs) if isinstance(pairs, Sized) else None
-    estimates = _estimates(iter(pairs), run, n_jobs, backend, options)
+    estimates = _estimates(map(_unpacked, pairs), run, n_jobs, backend, options)
     return _with_progress(estimates, total, progress)
+
+
+def _unpacked(pair: Pair | Matches) -> Pair:
+    return (pair.points1, pair.points2, pair.scores) if isinstance(pair, Matches) else pair
 
 
 def _estimates(
@@ -207,8 +211,6 @@ def _refuse() -> None:
 def _one(pair: Pair, options: dict[str, Any]) -> Estimate:
     """Estimate one pair; whatever goes wrong is its own result."""
     try:
-        if isinstance(pair, Matches):
-            pair = (pair.points1, pair.points2, pair.scores)
         items = tuple(pair) if isinstance(pair, Iterable) else None
         if items is None or not 2 <= len(items) <= 3:
             given = type(pair).__name__ if items is None else f"{len(items)} items"
@@ -241,7 +243,7 @@ def _alone(pair: Pair, options: dict[str, Any]) -> Estimate:
 
 def _failure(pair: Pair, reason: str) -> Estimate:
     try:
-        n = len(pair if isinstance(pair, Matches) else pair[0])  # type: ignore[arg-type]
+        n = len(pair[0])  # type: ignore[arg-type]
     except Exception:
         n = 0
     return Estimate(

@@ -764,7 +764,7 @@ def test_the_unit_of_length_hardly_matters_to_the_search(factor):
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("factor", [2.0**-7, 2.0**8])
 def test_the_unit_of_length_does_not_matter_to_what_is_made_of_the_draws(factor, seed, monkeypatch):
-    """A power of two leaves every rounding as it is."""
+    """A power of two leaves every rounding as it is, but those of some of BLAS's kernels."""
 
     def fit(points, threshold, confidence, max_iters, seed, best_first):
         rows = np.random.default_rng(seed).permutation(min(len(points), 60))[:12]

@@ -904,11 +904,11 @@ def test_only_lmeds_draws_for_what_most_agree_on():
 @pytest.mark.parametrize("method", ["lmeds", "usac_accurate"])
 def test_objects_that_move_on_their_own_pull_less_than_in_cv2(method):
     """Three in five of the wrong matches suit some F that is nearly right."""
-    pairs = [make_scene("moving_objects", 500, 0.7, 0.3, seed) for seed in range(32)]
+    pairs = [make_scene("moving_objects", 500, 0.7, 0.3, seed) for seed in range(48)]
     ours, cv2s = [], []
     for pair in pairs:
         points = pair.X[:, :2], pair.X[:, 2:]
         ours.append(pair.error(estimate_fundamental(*points, method=method).F))
         cv2s.append(pair.error(original(*points, METHODS[method], 1.0, 0.999, 5000)[0]))
-    assert np.mean(ours) < 0.8 * np.mean(cv2s)
-    assert np.median(ours) < 0.5 * np.median(cv2s)
+    assert np.mean(ours) < 0.6 * np.mean(cv2s)
+    assert np.median(ours) < 0.4 * np.median(cv2s)
