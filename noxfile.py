@@ -197,10 +197,8 @@ def lowest(session: nox.Session) -> None:
     check_floors(session, extras)
     # Old libraries complain about each other.
     leave = [f"-Wdefault::{name}" for name in ("DeprecationWarning", "FutureWarning")]
-    # The OpenBLAS of numpy 1 rounds otherwise on two threads, and workers of a pool have one.
-    env = {"OPENBLAS_NUM_THREADS": "1"}
     for suite in ((), ("compat",)):
-        session.run("python", "-m", "pytest", "-q", *leave, *suite, *session.posargs, env=env)
+        session.run("python", "-m", "pytest", "-q", *leave, *suite, *session.posargs)
 
 
 def check_floors(session: nox.Session, extras: list[str]) -> None:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cv_densityf._blas import times_vector
 from cv_densityf._engine import draw
 from cv_densityf._epipolar import (
     FAR,
@@ -523,7 +524,8 @@ class _Pool:
         several = polish(part, G[None], [np.inf], samples=samples)
         # Of so many, in a hurry: without cells and cameras, and at the largest width alone.
         widest = _VOTE_WIDTHS[-1] * width
-        votes = np.maximum(1.0 - part.sampson(several) / widest**2, 0.0) @ self._reliability[rows]
+        votes = np.maximum(1.0 - part.sampson(several) / widest**2, 0.0)
+        votes = times_vector(votes, self._reliability[rows])
         several = several[np.argsort(-votes, kind="stable")[:n_polished]]
         several = np.concatenate([G[None], several, *([] if others is None else [others])])
         several = polish(part, several, [_POLISH_WIDTH * width] * _LOCAL_STEPS)
@@ -648,7 +650,7 @@ def _at_most(size: int, rows: Ints, rng: np.random.Generator) -> Ints:
 
 def _alike(inliers: Floats, one: Floats, overlap: float) -> Bools:
     """Which of some inlier sets (m, n) agree with another one (n,)."""
-    common = inliers @ one
+    common = times_vector(inliers, one)
     return np.asarray(common >= overlap * (inliers.sum(axis=1) + one.sum() - common))
 
 

@@ -13,6 +13,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from cv_densityf._blas import parts, solved
+
 Rule = Literal["ransac", "lmeds", "usac"]
 Floats = NDArray[np.floating]
 
@@ -110,9 +112,6 @@ _MOMENT_ROWS, _MOMENTS = np.unique(
 _MOMENTS = _MOMENTS.reshape(2, 3, 3)
 #: Adds up what belongs to the same of these rows, (18, 11).
 _GATHERED = np.equal.outer(_MOMENTS.ravel(), np.arange(len(_MOMENT_ROWS))).astype(np.float64)
-#: OpenBLAS starts threads for products of more multiplications. They save microseconds, and cost
-#: milliseconds where the cores are busy; and the sums would depend on their number.
-_ONE_THREAD = 2**18
 
 
 class Frame:
@@ -180,7 +179,7 @@ class Frame:
 
     def _sums(self, weights: Floats, rows: Floats) -> Floats:
         """Weighted sums (m, r) of ``rows`` (r, n), for weights (m, n)."""
-        first, *others = self._parts(len(weights) * len(rows))
+        first, *others = parts(rows.shape[1], len(weights), len(rows))
         total = weights[:, first] @ rows[:, first].T
         for part in others:
             total += weights[:, part] @ rows[:, part].T
@@ -188,14 +187,8 @@ class Frame:
 
     def _combined(self, factors: Floats, rows: Floats) -> Floats:
         """Sum up ``rows`` (r, n) with ``factors`` (m, r), (m, n)."""
-        products = [factors @ rows[:, part] for part in self._parts(factors.size)]
+        products = [factors @ rows[:, part] for part in parts(rows.shape[1], *factors.shape)]
         return products[0] if len(products) == 1 else np.concatenate(products, axis=1)
-
-    def _parts(self, multiplications: int) -> list[slice]:
-        """Cut the matches, of so many multiplications each, to what one thread of BLAS does."""
-        n = self.products.shape[1]
-        size = max(1, _ONE_THREAD // max(1, multiplications))
-        return [slice(start, start + size) for start in range(0, n, size)]
 
     def sampson(self, G: Floats) -> Floats:
         """Squared Sampson distances in squared pixels, (m, n)."""
@@ -452,7 +445,7 @@ class _Linearized:
         """Matrices (m, 3, 3) a step further, of rank 2 and unit norm but for the second order."""
         trace = hessian.trace(axis1=1, axis2=2)[:, None, None] + _TINY
         stiff = (_STIFFNESS * self._stiff.transpose(0, 2, 1)) @ self._stiff + _DAMPING
-        step = np.linalg.solve(hessian + trace * stiff, gradient).reshape(-1, 3, 3)
+        step = solved(hessian + trace * stiff, gradient).reshape(-1, 3, 3)
         return np.asarray(self.G - step * np.minimum(1.0, 0.5 / (_norms(step) + _TINY)))
 
 

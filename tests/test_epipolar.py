@@ -201,20 +201,6 @@ def test_frame_sums_outer_squares_and_moments(n):
         np.testing.assert_allclose(second, (y * w) @ y.T, rtol=1e-9, atol=1e-9 * n)
 
 
-@pytest.mark.parametrize("multiplications", [9, 45, 16 * 45, 512 * 9, 2**20])
-@pytest.mark.parametrize("n", [1, 3000, 20_000])
-def test_products_are_small_enough_for_one_thread(n, multiplications):
-    parts = Frame(np.random.default_rng(0).normal(size=(n, 4)))._parts(multiplications)
-    numbers = np.arange(n)
-    np.testing.assert_array_equal(np.concatenate([numbers[part] for part in parts]), numbers)
-    for part in parts:
-        rows = len(numbers[part])
-        assert rows * multiplications <= 2**18 or rows == 1
-
-
-@pytest.mark.skipif(
-    int(np.__version__.split(".")[0]) < 2, reason="its OpenBLAS starts threads for any product"
-)
 def test_the_number_of_blas_threads_changes_no_bit():
     scene = noisy_scene(0, n=20_000, inlier_ratio=0.8)
     frame = Frame(scene.X)
