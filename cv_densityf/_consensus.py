@@ -73,8 +73,8 @@ _NEARLY = 0.97
 _SIGNIFICANT = 2.0
 #: Working thresholds within which a match is on a plane.
 _PLANE_WIDTH = 2.0
-#: With more than this share of the inliers on a plane, and no more off it than so many and this
-#: share of all that is off it, which may be by chance, the reason says so.
+#: With more than this share of the inliers on a plane the reason says so. F is open if those off it
+#: may be by chance: no more than so many and this share of all that is off it.
 _PLANAR = 0.9
 _BY_CHANCE = (8, 0.03)
 #: Draws from parts whose sizes differ by less than this factor are not independent.
@@ -235,7 +235,7 @@ def search(
     pool.complete()
     if not (in_vain or pool.agrees()):
         pool.optimise()
-    agreed, virtue, planar = pool.agrees_independently(), pool.virtue, pool.planar
+    agreed, virtue, (planar, by_chance) = pool.agrees_independently(), pool.virtue, pool.planar
     drawn = None
     if majority:
         watch.lap("polish")
@@ -255,20 +255,22 @@ def search(
     agreed = agreed and pool.best_has_inliers_of(F)
     F = shift(-centre[2:]).T @ F @ shift(-centre[:2])
     watch.lap("polish")
-    again = "found again by another" if agreed else "found by no other"
-    reason = f"the hypothesis with {virtue} of {n_draws} draws, {again}"
+    again, remark = "found again by another" if agreed else "found by no other", ""
     if in_vain:
-        reason += (
+        remark = (
             "; the search ended early: matches lie together only as by chance, and so do the "
             "inliers"
         )
     elif planar > _PLANAR:
-        # Draws that have the same inliers may have another F.
-        agreed = False
-        reason += (
-            f"; {planar:.0%} of its inliers suit one plane, or a camera that only turned, which "
-            "leaves F open"
-        )
+        remark = f"; {planar:.0%} of its inliers suit one plane, or a camera that only turned, "
+        if by_chance:
+            remark += "which leaves F open"
+            if agreed:
+                # Draws that have the same inliers may have another F.
+                agreed, again = False, "its inliers found again by another"
+        else:
+            remark += f"and F rests on the other {1 - planar:.0%}"
+    reason = f"the hypothesis with {virtue} of {n_draws} draws, {again}{remark}"
     return Consensus(F, reliability, tuple(pool.votes.tolist()), n_draws, agreed, reason)
 
 
@@ -535,14 +537,15 @@ class _Pool:
         return np.asarray(several[self._elected(votes, inliers, rows)])
 
     @property
-    def planar(self) -> float:
-        """Share of the best hypothesis's inliers on a plane; 0 if it is not the plane's alone."""
+    def planar(self) -> tuple[float, bool]:
+        """Share of the best hypothesis's inliers on a plane; whether the rest may be by chance."""
         planar = self._planar[self.near_best(1.0)]
-        n_off = len(planar) - np.count_nonzero(planar)
+        if len(planar) < FEWEST:
+            return 0.0, False
         few, share = _BY_CHANCE
-        if len(planar) < FEWEST or n_off > few + share * np.count_nonzero(~self._planar):
-            return 0.0
-        return float(planar.mean())
+        n_off = len(planar) - np.count_nonzero(planar)
+        by_chance = n_off <= few + share * np.count_nonzero(~self._planar)
+        return float(planar.mean()), bool(by_chance)
 
     @property
     def virtue(self) -> str:

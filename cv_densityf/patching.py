@@ -222,10 +222,10 @@ def patched(
     True
     """
     rule = DensityRule(density, alpha, dc_percent)
-    with _lock:
-        _patches.append(rule)
-        _install()
-    try:
+    try:  # from here on, for Ctrl-C may come at any time
+        with _lock:
+            _patches.append(rule)
+            _install()
         yield
     finally:
         with _lock:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -1018,7 +1020,7 @@ def test_the_reason_tells_of_matches_that_leave_f_open(seed, wrong):
 
 
 def test_a_few_matches_off_the_plane_do_not_leave_f_open():
-    """Of one in twenty, moved towards one point: more than chance has."""
+    """Of one in twenty, moved towards one point: more than chance has. So F rests on these."""
     told = 0
     for seed in range(8):
         rng = np.random.default_rng(seed)
@@ -1027,7 +1029,9 @@ def test_a_few_matches_off_the_plane_do_not_leave_f_open():
         second = np.hstack([first, np.ones((600, 1))]) @ H.T
         second[:30] += rng.uniform(0.1, 0.3, (30, 1)) * [900.0, 300.0, 1.0]
         X = np.hstack([first, second[:, :2] / second[:, 2:]]) + rng.normal(0, 0.2, (600, 4))
-        told += "F open" in find(X).reason
+        reason = find(X).reason
+        told += "F open" in reason
+        assert re.search("9[4-6]% .* (F open|F rests on the other [4-6]%)$", reason)
     assert told <= 1
 
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cv_densityf import findFundamentalMat
+from cv_densityf import findFundamentalMat, patching
 from cv_densityf._engine import original
 from cv_densityf.datasets import two_view_scene
 from cv_densityf.patching import (
@@ -107,6 +107,19 @@ def test_an_error_leaves_the_block_unpatched():
     with pytest.raises(cv2.error, match="Overload resolution failed"), patched():
         cv2.findFundamentalMat(P1)
     assert not is_patched()
+
+
+def test_an_interrupt_on_the_way_into_a_block_leaves_nothing_behind(monkeypatch):
+    def install_and_interrupt():
+        install()
+        raise KeyboardInterrupt
+
+    install = patching._install
+    monkeypatch.setattr(patching, "_install", install_and_interrupt)
+    with pytest.raises(KeyboardInterrupt), patched():
+        pytest.fail("inside")
+    assert cv2.findFundamentalMat is original
+    assert not patching._patches
 
 
 def test_blocks_overlap_between_threads():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import py_compile
 import re
 import signal
 import subprocess
@@ -77,7 +78,7 @@ WORLD = """
 """
 
 
-@pytest.mark.parametrize("kind", ["link", "package", "folder", "safe path"])
+@pytest.mark.parametrize("kind", ["link", "package", "folder", "compiled", "safe path"])
 def test_the_program_sees_the_world_as_under_python(both, tmp_path, kind):
     folder = tmp_path / "folder"
     write(folder / "program.py", WORLD)
@@ -85,10 +86,12 @@ def test_the_program_sees_the_world_as_under_python(both, tmp_path, kind):
     write(folder / "helper.py", "")
     write(tmp_path / "helper.py", "")
     (tmp_path / "link.py").symlink_to(folder / "program.py")
+    py_compile.compile(str(folder / "program.py"), str(folder / "program.pyc"))
     program, flags = {
         "link": (["link.py"], []),
         "package": (["-m", "folder"], []),
         "folder": (["folder"], []),
+        "compiled": (["folder/program.pyc"], []),
         # python -P puts no folder in front of the path, so that the helper is not found.
         "safe path": (["folder/program.py"], ["-P"]),
     }[kind]
