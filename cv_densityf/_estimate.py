@@ -22,7 +22,7 @@ from cv_densityf._arguments import (
 )
 from cv_densityf._consensus import search
 from cv_densityf._engine import Robust, method_flag
-from cv_densityf._epipolar import FAR, inlier_mask, middle
+from cv_densityf._epipolar import FAR, inlier_mask, lmeds_threshold, middle
 from cv_densityf._prefilter import KEPT, best_scored, contrast_support
 from cv_densityf._stopwatch import Stopwatch
 
@@ -232,12 +232,9 @@ def _estimate(
     watch.lap("mask")
     if np.count_nonzero(mask) < MINIMAL:
         return plain("too few matches fit at this threshold")
-    reason = found.reason
-    if robust.rule != "lmeds" and robust.threshold > _COARSE * about[1]:
-        share = robust.threshold / about[1]
-        reason = (
-            f"the threshold is {share:.2g} of the points' spread (are they in pixels?); {reason}"
-        )
+    derived = robust.rule == "lmeds"
+    limit = lmeds_threshold(F, X) if derived else robust.threshold
+    doubt = threshold_doubt(limit, about[1], derived)
     return Estimate(
         F=F,
         mask=mask,
@@ -246,10 +243,22 @@ def _estimate(
         n_draws=found.n_draws,
         agreed=found.agreed,
         engine="density",
-        reason=reason,
+        reason=f"{doubt}; {found.reason}" if doubt else found.reason,
         timings=watch.laps,
         votes=found.votes,
     )
+
+
+def threshold_doubt(threshold: float, spread: float, derived: bool) -> str:
+    """Ask about a threshold that is a good part of the points' spread; else an empty string.
+
+    It may be the caller's, or ``derived`` from the residuals.
+    """
+    share = threshold / spread
+    if share <= _COARSE:
+        return ""
+    question = "are more than half of the matches right?" if derived else "are they in pixels?"
+    return f"the threshold is {share:.2g} of the points' spread ({question})"
 
 
 def _search_threshold(spread: float, n: int, robust: Robust, density: str) -> float:

@@ -34,7 +34,7 @@ from cv_densityf._arguments import OFF, THRESHOLDS
 from cv_densityf._density import Kernel, checked_points, density_peaks
 from cv_densityf._display import DecisionGraphDisplay
 from cv_densityf._engine import METHODS, Robust, method_flag
-from cv_densityf._estimate import MIN_FILTERED, run
+from cv_densityf._estimate import MIN_FILTERED, run, threshold_doubt
 from cv_densityf._paper import paper_support
 from cv_densityf._prefilter import contrast_support, ranks, with_scores
 
@@ -572,7 +572,9 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         -----
         UserWarning
             If the prefilter drops rows and leaves fewer than 15, or no fundamental matrix is found
-            from those it leaves; all rows are used then.
+            from those it leaves; all rows are used then. If the threshold is more than a tenth of
+            the points' spread: they may be in other units than pixels, or have been scaled; or
+            fewer than half of them are right, for ``"lmeds"``.
         """
         # Pairs without F are ordinary: what the last one left must not pass for theirs.
         for name in [name for name in vars(self) if name.endswith("_")]:
@@ -761,11 +763,15 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
         elif rule == "ransac" and len(matches) < MIN_FILTERED:
             rule = "lmeds"
         self.threshold_: float = robust.threshold
-        if rule == "lmeds":
+        derived = rule == "lmeds"
+        if derived:
             # The scale is that of the rows of fit; from then on the rule is RANSAC's.
             self.threshold_ = _epipolar.lmeds_threshold(self.F_, matches)
             rule = "ransac"
         self._rule: Rule = rule
+        doubt = threshold_doubt(self.threshold_, _epipolar.middle(matches)[1], derived)
+        if doubt:
+            warnings.warn(f"{doubt}; inliers mean little then", stacklevel=3)
 
     def _inliers(self, matches: NDArray[np.float64]) -> NDArray[np.bool_]:
         return _epipolar.inlier_mask(self.F_, matches, self._rule, self.threshold_)

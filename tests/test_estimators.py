@@ -21,7 +21,7 @@ from sklearn.metrics import f1_score
 from sklearn.model_selection import GridSearchCV
 from sklearn.neighbors import LocalOutlierFactor
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import FunctionTransformer
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from sklearn.utils.estimator_checks import estimator_checks_generator, parametrize_with_checks
 from sklearn.utils.validation import validate_data
 
@@ -91,6 +91,7 @@ def expected_failures(estimator):
 
 @pytest.mark.filterwarnings("ignore:.*fewer than 15. all are kept:UserWarning")
 @pytest.mark.filterwarnings("ignore:no fundamental matrix from the:UserWarning")
+@pytest.mark.filterwarnings("ignore:the threshold is .* of the points' spread:UserWarning")
 @parametrize_with_checks(BATTERY, expected_failed_checks=expected_failures)
 def test_battery(estimator, check):
     check(estimator)
@@ -272,6 +273,21 @@ def test_eight_points_obey_the_threshold(scene):
     ransac.F_ = estimator.F_
     assert estimator.threshold_ == 0.7
     np.testing.assert_array_equal(estimator.inlier_mask_, ransac.score_samples(X) >= -0.7)
+
+
+@pytest.mark.parametrize("prefilter", ["auto", None, DensityPeaksFilter()])
+def test_a_threshold_as_wide_as_the_points_is_asked_about(scene, prefilter):
+    estimator = FundamentalMatrixEstimator(prefilter)
+    estimator.fit(scene.X)
+    with pytest.warns(UserWarning, match="points' spread .are they in pixels"):
+        estimator.fit(StandardScaler().fit_transform(scene.X))
+
+
+def test_lmeds_asks_whether_most_matches_are_right():
+    X = two_view_scene(400, inlier_ratio=0.3, random_state=5).X
+    with pytest.warns(UserWarning, match="are more than half of the matches right"):
+        estimator = FundamentalMatrixEstimator(method="lmeds").fit(X)
+    assert "are more than half of the matches right" in estimator.reason_
 
 
 def test_the_epipole_is_no_inlier(scene):

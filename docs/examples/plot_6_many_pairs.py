@@ -47,9 +47,10 @@ n_inliers = [estimate.n_inliers for estimate in estimates[:80]]
 
 # %%
 # The truth, known here, agrees: above .5 most inliers are right, below .35 F means nothing. Between
-# them are pairs of which a few right matches were found, too few for F. Numbers of inliers overlap.
-# How exact F is, coherence hardly says: above .5 it is 2 to 3 px off in the median, but 5 to 26 px
-# in a quarter of the pairs, nearly all of them with fewer than sixty inliers.
+# them are pairs of which a few right matches were found, too few for F. The number of inliers would
+# tell as well here, but the number to ask for grows with the threshold and that of the matches, and
+# nobody knows it beforehand. How exact F is, coherence hardly says: above .5 it is some 3 px off in
+# the median, and up to 26 px where few matches are right.
 
 distances = [
     epipolar_distance(estimate.F, scene.F, scene.size, scene.size)
