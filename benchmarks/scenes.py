@@ -48,6 +48,10 @@ class Kind:
         few enough are on it that the truth still has the majority.
     moving : float
         Share of the wrong matches that are on patches which move on their own.
+    still : float
+        Share of the wrong matches that stay where they are in the image, all over it.
+    patches : int
+        Number of patches that the true matches are on.
     unique : bool
         Whether the matches fix F. If not, any F that explains them is right.
     """
@@ -57,6 +61,8 @@ class Kind:
     motion: str = "sideways"
     coherent: float = 0.0
     moving: float = 0.0
+    still: float = 0.0
+    patches: int = N_PATCHES
     unique: bool = True
 
 
@@ -68,6 +74,7 @@ KINDS: dict[str, Kind] = {
     "one_plane": Kind(wall=1.0, truth_wall=1.0, unique=False),
     "rotation": Kind(motion="none", unique=False),
     "moving_objects": Kind(wall=0.7, motion="video", moving=0.9),
+    "turntable": Kind(wall=0.0, truth_wall=0.0, still=0.9, patches=4),
 }
 
 #: Numbers of matches, inlier ratios and noise (px) of each kind, unless asked otherwise.
@@ -130,11 +137,15 @@ def make_scene(kind: str, n: int, inlier_ratio: float, noise: float, seed: int =
     n_true = round(n * inlier_ratio)
     n_coherent = round((n - n_true) * spec.coherent)
     n_moving = round((n - n_true) * spec.moving)
-    true = world.matches(n_true, spec.wall, rng)
-    wrong = rng.uniform(0, np.tile(SIZE, 2), (n - n_true - n_coherent - n_moving, 4))
+    n_still = round((n - n_true) * spec.still)
+    patches = (0, spec.patches)
+    true = world.matches(n_true, spec.wall, rng, patches=patches)
+    n_random = n - n_true - n_coherent - n_moving - n_still
+    wrong = rng.uniform(0, np.tile(SIZE, 2), (n_random, 4))
     coherent = world.matches(n_coherent, 1.0, rng, period=PERIOD)
     moving = world.moving_matches(n_moving, rng)
-    noisy = [x + rng.normal(0, noise, x.shape) for x in (true, coherent, moving)]
+    still = np.tile(rng.uniform(0, SIZE, (n_still, 2)), 2)
+    noisy = [x + rng.normal(0, noise, x.shape) for x in (true, coherent, moving, still)]
     X = np.vstack([*noisy, wrong])
     # SIFT ratios: true matches are lower, with a wide overlap.
     ratio = np.concatenate([rng.beta(5, 3, n_true), rng.beta(12, 2, n - n_true)])
@@ -144,7 +155,7 @@ def make_scene(kind: str, n: int, inlier_ratio: float, noise: float, seed: int =
         group=f"n={n}, ratio={inlier_ratio:g}, noise={noise:g}",
         X=np.ascontiguousarray(X[order]),
         scores=1.0 - ratio[order],
-        truth=world.matches(N_TRUTH, spec.truth_wall, rng),
+        truth=world.matches(N_TRUTH, spec.truth_wall, rng, patches=patches),
         size1=SIZE,
         size2=SIZE,
         cameras=Cameras(K, K, R, t) if spec.unique else None,

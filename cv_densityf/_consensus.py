@@ -71,6 +71,10 @@ _AGREEMENT = 0.93
 #: sparse and of little reliability. With fewer votes it fits a crowd of wrong ones there.
 _NEARLY = 0.97
 _SIGNIFICANT = 2.0
+#: Of two motions one that most matches suit is the better one if more are near, within so many
+#: medians of its residuals, whose squares are not quite 0.
+_MEDIANS = 2.5
+_EXACT = 1e-30
 #: Working thresholds within which a match is on a plane.
 _PLANE_WIDTH = 2.0
 #: With more than this share of the inliers on a plane the reason says so. F is open if those off it
@@ -387,7 +391,10 @@ class _Pool:
         #: The matches on the plane that most inliers suit, dominant or not.
         self._planar = np.zeros(len(X), dtype=bool)
         self._X = X
-        self._reliability = reliability = reliability / _claimants(X)
+        #: What a match counts where matches are counted.
+        self._share = (1.0 / _claimants(X)).astype(np.float32)
+        self._half = 0.5 * self._share.sum()
+        self._reliability = reliability = reliability * self._share
         self._reliable = reliable
         self._rng = rng
         self._frame = frame or Frame(X)
@@ -427,7 +434,7 @@ class _Pool:
         self._inliers = np.concatenate([self._inliers, self._inliers_by(squared)])
         self.votes = np.concatenate([self.votes, votes])
         self._sizes = np.concatenate([self._sizes, sizes])
-        self.best = self._elected(self.votes, self._inliers)
+        self.best = self._for_most(self._elected(self.votes, self._inliers))
 
     def _inliers_by(self, squared: Floats) -> Floats:
         return (squared < self.working**2).astype(np.float32)
@@ -446,6 +453,28 @@ class _Pool:
         lead[votes < _NEARLY * votes[elected]] = -np.inf
         # Its own lead is 0.
         return int(lead.argmax()) if lead.max() > 0 else elected
+
+    def _for_most(self, elected: int) -> int:
+        """Index of another motion that suits most matches, and more than the elected; or of that.
+
+        Votes count crowds less, and a crowd may be most of the matches: an object before a
+        background that has a motion, or none, of its own. What is spread then leaves F free to suit
+        a part of the object as well.
+        """
+        near = (self._squared < self.threshold**2).astype(np.float32)
+        most = times_vector(near, self._share) > self._half
+        if not most.any():
+            return elected
+        most &= ~_alike(self._inliers, self._inliers[elected], _SAME_BASIN)
+        if not most.any():
+            return elected
+        rivals, half = np.flatnonzero(most), len(self._X) // 2
+        median = np.partition(self._squared[rivals], half)[:, half, None]
+        width = np.clip(_MEDIANS**2 * median, _EXACT, self.threshold**2)
+        gain = np.maximum(1.0 - self._squared[rivals] / width, 0.0)
+        gain = (gain - np.maximum(1.0 - self._squared[elected] / width, 0.0)) * self._share
+        lead = gain.sum(axis=1) - np.sqrt((gain * gain).sum(axis=1))
+        return int(rivals[lead.argmax()]) if lead.max() > 0 else elected
 
     def _poll(self, G: Floats) -> tuple[Floats, Floats]:
         """Squared residuals (m, n) of hypotheses and the votes for them (m,)."""
@@ -552,7 +581,9 @@ class _Pool:
         """What the best hypothesis has most of."""
         if self.best == self.votes.argmax():
             return "the most votes"
-        return "the most inliers off a dominant plane"
+        if self.best == self._elected(self.votes, self._inliers):
+            return "the most inliers off a dominant plane"
+        return "the most inliers"
 
     def agrees_independently(self) -> bool:
         """Whether draws that no hypothesis had a say in agree, off a dominant plane as well."""

@@ -75,14 +75,21 @@ def inlier_mask(F: Floats, X: Floats, rule: Rule, threshold: float) -> NDArray[n
     standard deviations, estimated from the median over the finite rows; ``threshold`` is unused.
     Rows with a non-finite residual are no inliers.
     """
+    return mask_and_threshold(F, X, rule, threshold)[0]
+
+
+def mask_and_threshold(
+    F: Floats, X: Floats, rule: Rule, threshold: float
+) -> tuple[NDArray[np.bool_], float]:
+    """`inlier_mask`, and the threshold: for ``"lmeds"`` the one that follows from the residuals."""
     with np.errstate(all="ignore"):
         if rule == "usac":
             error = _sampson_squared(F.astype(np.float32), X.astype(np.float32))
-            return np.asarray(error.astype(np.float64) < threshold * threshold)
+            return np.asarray(error.astype(np.float64) < threshold * threshold), threshold
         error = point_line_squared(F, X).astype(np.float32)
         if rule == "lmeds":
             threshold = _lmeds_threshold(error)
-        return np.asarray(error <= np.float32(threshold * threshold))
+        return np.asarray(error <= np.float32(threshold * threshold)), threshold
 
 
 def lmeds_threshold(F: Floats, X: Floats) -> float:

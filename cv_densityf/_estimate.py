@@ -22,7 +22,7 @@ from cv_densityf._arguments import (
 )
 from cv_densityf._consensus import search
 from cv_densityf._engine import Robust, method_flag
-from cv_densityf._epipolar import FAR, inlier_mask, lmeds_threshold, middle
+from cv_densityf._epipolar import FAR, mask_and_threshold, middle
 from cv_densityf._prefilter import KEPT, best_scored, contrast_support
 from cv_densityf._stopwatch import Stopwatch
 
@@ -228,13 +228,11 @@ def _estimate(
     reliability = np.full(n, np.nan)
     reliability[rows] = found.reliability
     F = found.F * np.outer([units[1], units[1], 1.0], [units[0], units[0], 1.0])
-    mask = inlier_mask(F, X, robust.rule, robust.threshold)
+    mask, limit = mask_and_threshold(F, X, robust.rule, robust.threshold)
     watch.lap("mask")
     if np.count_nonzero(mask) < MINIMAL:
         return plain("too few matches fit at this threshold")
-    derived = robust.rule == "lmeds"
-    limit = lmeds_threshold(F, X) if derived else robust.threshold
-    doubt = threshold_doubt(limit, about[1], derived)
+    doubt = threshold_doubt(limit, about[1], derived=robust.rule == "lmeds")
     return Estimate(
         F=F,
         mask=mask,

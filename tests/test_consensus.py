@@ -185,7 +185,8 @@ def test_cameras_that_can_exist_win_over_a_few_more_votes(seed, monkeypatch):
         F, others = impossible(rng, rng.uniform(low, high, (500, 4)))
         if len(others) > 110:
             break
-    X = np.vstack([scene.X, others[:110]])
+    # Strays, so that neither has the majority.
+    X = np.vstack([scene.X, others[:110], rng.uniform(low, high, (60, 4))])
     everyone = np.arange(len(X))
 
     def winner():
@@ -1001,6 +1002,35 @@ def test_the_reason_tells_of_agreement(monkeypatch):
     assert found.agreed
     monkeypatch.setattr(_Pool, "agrees", lambda *_, **__: False)
     assert find(X).reason.endswith(" draws, found by no other")
+
+
+def turntable(seed, n=400, share=0.75):
+    """Matches of an object in the middle that turns, and of a background that stays; and judges."""
+    rng = np.random.default_rng(seed)
+    K = np.array([[1000.0, 0, 640], [0, 1000, 480], [0, 0, 1]])
+    n_object = round(n * share)
+    points = rng.normal([0, 0, 10], 0.7, (n_object + 200, 3))
+    angle = rng.uniform(0.2, 0.4)
+    R = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    turned = (points - [0, 0, 10]) @ R.T + [0, rng.uniform(-0.2, 0.2), 10]
+    images = [p @ K.T for p in (points, turned)]
+    X = np.hstack([p[:, :2] / p[:, 2:] for p in images])
+    judges, X = X[n_object:], X[:n_object] + rng.normal(0, 0.5, (n_object, 4))
+    still = np.tile(rng.uniform(0, [1280, 960], (n - n_object, 2)), 2)
+    still += rng.normal(0, 0.1, still.shape)
+    return rng.permutation(np.vstack([X, still])), judges
+
+
+@pytest.mark.parametrize("majority", [False, True])
+def test_most_matches_win_over_fewer_that_are_spread(majority):
+    """Cell by cell the background has more votes; but it is a quarter of the matches."""
+    errors = []
+    for seed in range(12):
+        X, judges = turntable(seed)
+        found = find(X, majority=majority)
+        errors.append(sampson_distance(found.F, judges).mean())
+        assert found.reason.startswith("the hypothesis with the most ")
+    assert max(errors) < 1.0
 
 
 @pytest.mark.parametrize("wrong", [0, 200])
