@@ -47,6 +47,12 @@ FEW_RANKED = 250
 _SEARCH_THRESHOLD = 0.01
 _MORE_FOR_FEW = 0.25
 _LEEWAY = 2.0
+#: Points that were rounded to a lattice have this part of its step for a threshold at least: they
+#: are off by up to half of it, and there are wrong matrices that suit many of them exactly. So many
+#: tell whether there is one, by gaps that are whole multiples of the step but for so much.
+_OF_STEP = 0.8
+_TELL_STEP = 200
+_WHOLE = 1e-3
 #: Matches of a minimal sample: fewer have no F, and an F that explains fewer is none.
 MINIMAL = 7
 #: If one image is so many times as large as the other, they are in different units.
@@ -191,7 +197,11 @@ def _estimate(
         "max_iters": robust.max_iters,
         "seed": seed,
     }
-    lowest = rule.alpha if density == "paper" else KEPT
+    lowest = rule.alpha
+    if density != "paper":
+        lowest = KEPT
+        of_step = _OF_STEP * _lattice_step(Z, asked["threshold"])
+        asked["threshold"] = max(asked["threshold"], of_step)
     with np.errstate(all="ignore"):
         try:
             if density == "paper":
@@ -267,6 +277,20 @@ def _search_threshold(spread: float, n: int, robust: Robust, density: str) -> fl
         return robust.threshold
     most = max(robust.threshold * _LEEWAY, own / _LEEWAY)
     return min(max(own, robust.threshold / _LEEWAY), most)
+
+
+def _lattice_step(X: NDArray[np.float64], least: float) -> float:
+    """Step of the lattice that the coordinates are on, all of them; 0 if none or below ``least``.
+
+    Some of the matches tell.
+    """
+    gaps = np.diff(np.sort(X[:_TELL_STEP].T))
+    steps = np.where(gaps > 0.0, gaps, np.inf).min(axis=1, keepdims=True)
+    step = float(steps.min())
+    if not least <= step < np.inf:
+        return 0.0
+    gaps /= steps
+    return step if (np.abs(gaps - np.rint(gaps)) < _WHOLE).all() else 0.0
 
 
 def _rankings(
@@ -402,7 +426,8 @@ def estimate_fundamental(
         Largest residual of an inlier, pixels, in (1e-12, 1e6); unused by ``"lmeds"``, which finds
         its own. It rules the mask: the search has one of its own, a hundredth of the points'
         spread and, of n matches, a quarter of an n-th, brought to within a factor of two of this
-        one, but never below half of its own; ``density="paper"`` takes this one.
+        one, but never below half of its own, nor below .8 steps of a lattice that all points are
+        on; ``density="paper"`` takes this one.
     confidence : float
         Of each draw to have found the best model, in (0, 1).
     max_iters : int

@@ -208,9 +208,10 @@ def findFundamentalMat(
     On the default path the threshold, the confidence and the seed of ``params`` count, its sampler
     only as far as PROSAC's means that the rows come best first. The threshold rules the mask; the
     search has one of its own, a hundredth of the points' spread and, of n matches, a quarter of an
-    n-th, brought to within a factor of two of it, but never below half of its own. There are up to
-    sixteen draws, twice as many for more than 1,000 matches, and one more for ``FM_LMEDS``; each
-    ends after at most ``maxIters`` and a thousand samples.
+    n-th, brought to within a factor of two of it, but never below half of its own, nor below .8
+    steps of a lattice that all points are on. There are up to sixteen draws, twice as many for more
+    than 1,000 matches, and one more for ``FM_LMEDS``; each ends after at most ``maxIters`` and a
+    thousand samples.
     ``density="paper"`` draws at the threshold given, and up to ``maxIters`` samples.
 
     Of more than 1,000 matches density looks at a seeded 1,000, without ``scores`` at 250 if most of

@@ -892,6 +892,36 @@ def test_the_searchs_threshold_is_a_hundredth_of_the_spread_near_the_callers(
         assert _estimate._search_threshold(300.0, n, robust, "paper") == threshold
 
 
+@pytest.mark.parametrize("step", [8.0, 8 / 3])
+@pytest.mark.parametrize("n", [60, 400])
+def test_a_lattice_is_known_by_its_step(n, step):
+    X = np.random.default_rng(0).uniform(0, [640, 480] * 2, (n, 4))
+    whole = np.rint(X / step) * step
+    assert _estimate._lattice_step(whole, 2.0) == pytest.approx(step)
+    assert _estimate._lattice_step(whole, 10.0) == 0.0
+    # A grid in one image alone is where the matcher asked, not what it rounded to.
+    for columns in (slice(0, 2), slice(2, 4)):
+        mixed = X.copy()
+        mixed[:, columns] = whole[:, columns]
+        assert _estimate._lattice_step(mixed, 2.0) == 0.0
+    assert _estimate._lattice_step(X, 2.0) == 0.0
+    assert _estimate._lattice_step(np.ones((300, 4)), 2.0) == 0.0
+
+
+@pytest.mark.parametrize("method", ["lmeds", "usac_accurate"])
+def test_points_on_a_lattice_cost_less_than_in_cv2(method):
+    """Wrong matrices suit many of them exactly."""
+    errors = []
+    for seed in range(12):
+        X = np.rint(scene_of(seed, n=500, inlier_ratio=0.7, noise=0.3).X / 16) * 16
+        F, _ = original(X[:, :2], X[:, 2:], METHODS[method], 3.0, 0.999, 5000)
+        Fs = estimate(X, method=method, threshold=3.0).F, F
+        errors.append([sampson_distance(F, true_matches(seed)).mean() for F in Fs])
+    ours, cv2s = np.array(errors).T
+    assert ours.max() < 5.0
+    assert np.median(ours) < 0.6 * np.median(cv2s)
+
+
 def test_only_lmeds_draws_for_what_most_agree_on():
     scene = two_view_scene(400, inlier_ratio=0.8, noise=0.3, random_state=0)
     draws = {
