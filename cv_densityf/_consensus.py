@@ -71,8 +71,12 @@ _AGREEMENT = 0.93
 #: sparse and of little reliability. With fewer votes it fits a crowd of wrong ones there.
 _NEARLY = 0.97
 _SIGNIFICANT = 2.0
-#: Of two motions one that most matches suit is the better one if more are near, within so many
-#: medians of its residuals, whose squares are not quite 0.
+#: Another motion is taken in place of the one with the most votes where the sum of its matches,
+#: each of which counts less the farther it is, is larger by so many standard deviations of chance.
+#: It has to have this part of its inliers at least. If most matches suit it, they count within so
+#: many medians of its residuals, whose squares are not quite 0.
+_CLEARLY = 1.25
+_AT_LEAST = 0.85
 _MEDIANS = 2.5
 _EXACT = 1e-30
 #: Working thresholds within which a match is on a plane.
@@ -393,7 +397,6 @@ class _Pool:
         self._X = X
         #: What a match counts where matches are counted.
         self._share = (1.0 / _claimants(X)).astype(np.float32)
-        self._half = 0.5 * self._share.sum()
         self._reliability = reliability = reliability * self._share
         self._reliable = reliable
         self._rng = rng
@@ -434,7 +437,7 @@ class _Pool:
         self._inliers = np.concatenate([self._inliers, self._inliers_by(squared)])
         self.votes = np.concatenate([self.votes, votes])
         self._sizes = np.concatenate([self._sizes, sizes])
-        self.best = self._for_most(self._elected(self.votes, self._inliers))
+        self.best = self._for_more(self._elected(self.votes, self._inliers))
 
     def _inliers_by(self, squared: Floats) -> Floats:
         return (squared < self.working**2).astype(np.float32)
@@ -454,27 +457,31 @@ class _Pool:
         # Its own lead is 0.
         return int(lead.argmax()) if lead.max() > 0 else elected
 
-    def _for_most(self, elected: int) -> int:
-        """Index of another motion that suits most matches, and more than the elected; or of that.
+    def _for_more(self, elected: int) -> int:
+        """Index of another motion that clearly more matches suit than the elected; or of that.
 
-        Votes count crowds less, and a crowd may be most of the matches: an object before a
-        background that has a motion, or none, of its own. What is spread then leaves F free to suit
-        a part of the object as well.
+        Votes count crowds less, and a crowd may be the larger part: an object before a background
+        that has a motion, or none, of its own. What is spread then leaves F free to suit a part of
+        the object as well.
         """
-        near = (self._squared < self.threshold**2).astype(np.float32)
-        most = times_vector(near, self._share) > self._half
-        if not most.any():
+        rivals = ~_alike(self._inliers, self._inliers[elected], _SAME_BASIN)
+        if not rivals.any():
             return elected
-        most &= ~_alike(self._inliers, self._inliers[elected], _SAME_BASIN)
-        if not most.any():
+        numbers = times_vector(self._inliers, self._share)
+        rivals &= numbers > _AT_LEAST * numbers[elected]
+        if not rivals.any():
             return elected
-        rivals, half = np.flatnonzero(most), len(self._X) // 2
-        median = np.partition(self._squared[rivals], half)[:, half, None]
-        width = np.clip(_MEDIANS**2 * median, _EXACT, self.threshold**2)
-        gain = np.maximum(1.0 - self._squared[rivals] / width, 0.0)
+        squared = self._squared[rivals]
+        # Where most matches suit it, these tell the noise, and what else is near is by chance.
+        near = times_vector((squared < self.threshold**2).astype(np.float32), self._share)
+        median = np.partition(squared, len(self._X) // 2)[:, len(self._X) // 2]
+        narrow = np.clip(_MEDIANS**2 * median, _EXACT, self.threshold**2)
+        width = np.where(near > 0.5 * self._share.sum(), narrow, self.working**2)[:, None]
+        gain = np.maximum(1.0 - squared / width, 0.0)
         gain = (gain - np.maximum(1.0 - self._squared[elected] / width, 0.0)) * self._share
-        lead = gain.sum(axis=1) - np.sqrt((gain * gain).sum(axis=1))
-        return int(rivals[lead.argmax()]) if lead.max() > 0 else elected
+        lead = gain.sum(axis=1) - _CLEARLY * np.sqrt((gain * gain).sum(axis=1))
+        best = int(lead.argmax())
+        return int(np.flatnonzero(rivals)[best]) if lead[best] > 0.0 else elected
 
     def _poll(self, G: Floats) -> tuple[Floats, Floats]:
         """Squared residuals (m, n) of hypotheses and the votes for them (m,)."""
