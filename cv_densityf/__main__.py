@@ -554,7 +554,7 @@ def _for_people(report: dict[str, Any], robust: Robust) -> str:
     names = ["kept as dense", "inliers", "coherence", "median residual, px", "processor time, ms"]
     threshold = f", threshold {report['threshold']:g} px" if by_threshold else ""
     scored = " with scores" if report["scores"] else ""
-    lines = [f"{n} matches{scored}, {report['method']}{threshold}", ""]
+    lines = [f"{n} match{'es' if n != 1 else ''}{scored}, {report['method']}{threshold}", ""]
     if report["cv2"] is not None and "plain cv2" not in times:
         lines.append(f"{'':<22}{'plain cv2':>12}")
         lines += [f"{name:<22}{a:>12}" for name, a in zip(names[1:], ours[1:], strict=True)]

@@ -129,6 +129,8 @@ def points_inside(lines: Floats, size: Floats, shares: Floats) -> tuple[Floats, 
 
 
 def _matrix(F: ArrayLike, name: str) -> Floats:
+    if F is None:
+        raise ValueError(f"{name} is None: there is no fundamental matrix to compare")
     F = real(F, name)
     if F.shape != (3, 3):
         raise ValueError(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from cv_densityf._arguments import check
 
@@ -44,6 +44,10 @@ class Scene:
         """The matches as rows x, y, x', y', (n, 4) float64."""
         return np.hstack([self.points1, self.points2])
 
+    def __repr__(self) -> str:
+        n_right = np.count_nonzero(self.inliers)
+        return f"<Scene: {len(self.inliers)} matches, {n_right} of them right>"
+
 
 @dataclass(frozen=True, eq=False)
 class ImagePair:
@@ -65,7 +69,11 @@ class ImagePair:
     points1: NDArray[np.float64]
     points2: NDArray[np.float64]
 
-    def error(self, F: NDArray[np.float64] | None) -> float:
+    def __repr__(self) -> str:
+        shapes = " and ".join(f"{w} x {h}" for h, w, _ in (self.image1.shape, self.image2.shape))
+        return f"<ImagePair: {shapes} pixels>"
+
+    def error(self, F: ArrayLike | None) -> float:
         """Mean distance of the true correspondences to the epipolar lines of ``F``.
 
         Parameters
@@ -80,6 +88,7 @@ class ImagePair:
         """
         if F is None:
             return float("inf")
+        F = np.asarray(F, dtype=np.float64)
         one = np.ones((len(self.points1), 1))
         x1, x2 = np.hstack([self.points1, one]), np.hstack([self.points2, one])
         line1, line2 = x2 @ F, x1 @ F.T

@@ -74,6 +74,10 @@ class Matches:
     def __len__(self) -> int:
         return len(self.points1)
 
+    def __repr__(self) -> str:
+        (width1, height1), (width2, height2) = self.size1, self.size2
+        return f"<Matches: {len(self)} of {width1} x {height1} and {width2} x {height2} pixels>"
+
 
 def read_image(path: str | os.PathLike[str]) -> NDArray[Any]:
     """Read an image file as ``cv2.imread`` does, but keep its bit depth and say what is wrong.
@@ -96,9 +100,10 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[Any]:
     cv_densityf.InputError
         A ``ValueError``: OpenCV cannot decode the file.
     """
+    path = os.fspath(path)
     # Read whole, this would only be refused by OpenCV.
     if os.path.getsize(path) > _MAX_BYTES:
-        raise InputError(f"{os.fspath(path)}: larger than the 2 GB that OpenCV can decode")
+        raise InputError(f"{path}: larger than the 2 GB that OpenCV can decode")
     # Not cv2.imread: it writes its own warnings, and cannot tell a missing file from a bad one.
     with open(path, "rb") as stream:  # which may be a pipe
         data = stream.read()
@@ -112,7 +117,7 @@ def read_image(path: str | os.PathLike[str]) -> NDArray[Any]:
     except cv2.error:
         image = None
     if image is None:
-        raise InputError(f"{os.fspath(path)}: not an image that OpenCV can read")
+        raise InputError(f"{path}: not an image that OpenCV can read")
     return image
 
 

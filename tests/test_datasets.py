@@ -7,6 +7,7 @@ import pytest
 from cv_densityf import datasets
 from cv_densityf._epipolar import sampson_distance
 from cv_densityf.datasets import ImagePair, motorcycle, two_view_scene
+from cv_densityf.matching import Matches
 
 
 class TestTwoViewScene:
@@ -129,3 +130,13 @@ class TestMotorcycle:
         monkeypatch.setattr(datasets, "_skimage_data", lambda: tmp_path)
         with pytest.raises(FileNotFoundError, match="reinstall scikit-image"):
             motorcycle()
+
+
+def test_the_console_shows_what_it_is_and_not_all_of_it():
+    scene = two_view_scene(200, inlier_ratio=0.4)
+    assert repr(scene) == "<Scene: 200 matches, 80 of them right>"
+    black, grey = np.zeros((60, 80, 3), np.uint8), np.zeros((30, 40, 3), np.uint8)
+    pair = ImagePair(black, grey, scene.F, scene.points1, scene.points2)
+    assert repr(pair) == "<ImagePair: 80 x 60 and 40 x 30 pixels>"
+    matches = Matches(scene.points1, scene.points2, np.ones(200), (80, 60), (40, 30))
+    assert repr(matches) == "<Matches: 200 of 80 x 60 and 40 x 30 pixels>"
