@@ -213,11 +213,7 @@ def _one(pair: Pair, options: dict[str, Any]) -> Estimate:
     try:
         items = tuple(pair) if isinstance(pair, Iterable) else None
         if items is None or not 2 <= len(items) <= 3:
-            given = (
-                type(pair).__name__
-                if items is None
-                else f"{len(items)} item{'s' * (len(items) != 1)}"
-            )
+            given = type(pair).__name__ if items is None else f"{len(items)} items"
             raise ValueError(
                 f"a pair is (points1, points2) or (points1, points2, scores), not {given}"
             )
