@@ -512,6 +512,7 @@ def in_a_process(name):
     # Said to the caller, and no fault: too few rows for a filter; numpy on complex numbers, and on
     # coordinates beyond cv2's float32 in an estimator.
     warnings.filterwarnings("ignore", ".* rows would be left", UserWarning)
+    warnings.filterwarnings("ignore", "the threshold is .* of the points' spread", UserWarning)
     warnings.filterwarnings("ignore", category=np.exceptions.ComplexWarning)
     warnings.filterwarnings("ignore", "overflow encountered in cast", RuntimeWarning)
     warnings.filterwarnings("ignore", category=HypothesisWarning)
