@@ -262,11 +262,10 @@ def threshold_doubt(threshold: float, spread: float, derived: bool) -> str:
 
     It may be the caller's, or ``derived`` from the residuals.
     """
-    share = threshold / spread
-    if share <= _COARSE:
+    if threshold <= _COARSE * spread or spread == 0.0:
         return ""
     question = "are more than half of the matches right?" if derived else "are they in pixels?"
-    return f"the threshold is {share:.2g} of the points' spread ({question})"
+    return f"the threshold is {threshold / spread:.2g} of the points' spread ({question})"
 
 
 def _search_threshold(spread: float, n: int, robust: Robust, density: str) -> float:

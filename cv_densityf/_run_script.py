@@ -9,6 +9,7 @@ import os
 import pkgutil
 import sys
 from importlib.machinery import SourceFileLoader, SourcelessFileLoader
+from io import BytesIO
 
 # What the interpreter itself calls for -m and for folders; the public functions of runpy put
 # another __main__ back before threads and exit handlers of the program have come to their end.
@@ -93,8 +94,6 @@ def _run_path(main: ModuleType, script: str, *arguments: str) -> int:
     path = os.path.abspath(script)
     try:
         with open(path, "rb") as file:
-            compiled = pkgutil.read_code(file)
-            file.seek(0)
             source = file.read()
     except OSError as error:
         reason = f"[Errno {error.errno}] {error.strerror}"
@@ -102,6 +101,7 @@ def _run_path(main: ModuleType, script: str, *arguments: str) -> int:
         return CANNOT_OPEN
     if not sys.flags.safe_path:  # python -P and -I put nothing in front
         sys.path[0] = os.path.dirname(os.path.realpath(path))
+    compiled = pkgutil.read_code(BytesIO(source))
     loader = SourceFileLoader if compiled is None else SourcelessFileLoader
     vars(main).update(__file__=path, __cached__=None, __loader__=loader("__main__", path))
     exec(compiled or compile(source, path, "exec", dont_inherit=True), vars(main))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import py_compile
 import re
 import signal
@@ -101,6 +102,13 @@ def test_the_program_sees_the_world_as_under_python(both, tmp_path, kind):
     else:
         assert (code, err) == (0, "")
         assert out.endswith("thread done\nexit handler done\n")
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/stdin"), reason="no such file here")
+def test_the_program_may_come_from_a_pipe():
+    asked = [sys.executable, *RUN, "/dev/stdin"]
+    done = subprocess.run(asked, input="print('read')", capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("read\n", "")
 
 
 @pytest.mark.parametrize(
