@@ -16,12 +16,12 @@ Floats = NDArray[np.floating]
 _NUMPY_1 = np.lib.NumpyVersion(np.__version__) < "2.0.0"
 #: Multiplications that one thread does.
 _MOST = 2**18
-_MOST_WITH_VECTOR = 9_000 if _NUMPY_1 else _MOST
+_MOST_WITH_VECTOR = 9_000
 
 
 def parts(n: int, m: int, r: int) -> list[slice]:
     """Cut n columns of r rows, to be multiplied with m vectors, to what one thread does."""
-    most = _MOST if m > 1 else _MOST_WITH_VECTOR
+    most = _MOST_WITH_VECTOR if _NUMPY_1 and m == 1 else _MOST
     size = max(1, most // max(1, m * r))
     return [slice(start, start + size) for start in range(0, n, size)]
 

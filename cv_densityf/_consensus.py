@@ -71,10 +71,10 @@ _AGREEMENT = 0.93
 #: sparse and of little reliability. With fewer votes it fits a crowd of wrong ones there.
 _NEARLY = 0.97
 _SIGNIFICANT = 2.0
-#: Another motion is taken in place of the one with the most votes where the sum of its matches,
-#: each of which counts less the farther it is, is larger by so many standard deviations of chance.
-#: It has to have this part of its inliers at least. If most matches suit it, they count within so
-#: many medians of its residuals, whose squares are not quite 0.
+#: A rival, another motion than the one with the most votes, is taken in its place where the sum of
+#: the matches, each of which counts less the farther it is, is larger by so many standard
+#: deviations of chance. It has to have this part of the other's inliers at least. If most matches
+#: suit the rival, they count within so many medians of its residuals, whose squares are not quite 0.
 _CLEARLY = 1.25
 _AT_LEAST = 0.85
 _MEDIANS = 2.5
@@ -270,14 +270,14 @@ def search(
             "inliers"
         )
     elif planar > _PLANAR:
-        remark = f"; {planar:.0%} of its inliers suit one plane, or a camera that only turned, "
+        remark = f"; {planar:.1%} of its inliers suit one plane, or a camera that only turned, "
         if by_chance:
             remark += "which leaves F open"
             if agreed:
                 # Draws that have the same inliers may have another F.
                 agreed, again = False, "its inliers found again by another"
         else:
-            remark += f"and F rests on the other {1 - planar:.0%}"
+            remark += f"and F rests on the other {1 - planar:.1%}"
     reason = f"the hypothesis with {virtue} of {n_draws} draws, {again}{remark}"
     return Consensus(F, reliability, tuple(pool.votes.tolist()), n_draws, agreed, reason)
 
@@ -590,7 +590,7 @@ class _Pool:
             return "the most votes"
         if self.best == self._elected(self.votes, self._inliers):
             return "the most inliers off a dominant plane"
-        return "the most inliers"
+        return "more matches near it than the one with the most votes"
 
     def agrees_independently(self) -> bool:
         """Whether draws that no hypothesis had a say in agree, off a dominant plane as well."""
@@ -659,7 +659,7 @@ class _Pool:
     def _finalists(self, most: int, overlap: float) -> list[int]:
         """Return the indices of the best hypotheses whose inliers overlap by less."""
         ranking = np.argsort(-self.votes, kind="stable").tolist()
-        # What has lost on a dominant plane is out.
+        # What had more votes, and lost, is out.
         ranking = ranking[ranking.index(self.best) :]
         chosen: list[int] = []
         for i in ranking:

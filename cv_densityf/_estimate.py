@@ -99,6 +99,7 @@ class Estimate:
         the best of them becomes after that has none, nor has the draw that only ``"lmeds"`` makes.
         Of many matches, those of the part that searched. Where a plane is dominant, the best one's
         may be 3 % less than the largest: among these the number of inliers off the plane decides.
+        And it may be far less where clearly more matches are near another motion.
 
     See Also
     --------
@@ -200,7 +201,7 @@ def _estimate(
     lowest = rule.alpha
     if density != "paper":
         lowest = KEPT
-        of_step = _OF_STEP * _lattice_step(Z, asked["threshold"])
+        of_step = _OF_STEP * _lattice_step(Z, asked["threshold"], _COARSE * about[1])
         asked["threshold"] = max(asked["threshold"], of_step)
     with np.errstate(all="ignore"):
         try:
@@ -278,16 +279,15 @@ def _search_threshold(spread: float, n: int, robust: Robust, density: str) -> fl
     return min(max(own, robust.threshold / _LEEWAY), most)
 
 
-def _lattice_step(X: NDArray[np.float64], least: float) -> float:
-    """Step of the lattice that the coordinates are on, all of them; 0 if none or below ``least``.
-
-    Some of the matches tell.
-    """
-    gaps = np.diff(np.sort(X[:_TELL_STEP].T))
-    steps = np.where(gaps > 0.0, gaps, np.inf).min(axis=1, keepdims=True)
-    step = float(steps.min())
-    if not least <= step < np.inf:
-        return 0.0
+def _lattice_step(X: NDArray[np.float64], least: float, most: float) -> float:
+    """Step of the lattice that all coordinates are on; 0 if there is none between these limits."""
+    # Mostly some matches tell that there is none.
+    for part in (X[:_TELL_STEP], X):
+        gaps = np.diff(np.sort(part.T))
+        steps = np.where(gaps > 0.0, gaps, np.inf).min(axis=1, keepdims=True)
+        step = float(steps.min())
+        if not least <= step <= most:
+            return 0.0
     gaps /= steps
     return step if (np.abs(gaps - np.rint(gaps)) < _WHOLE).all() else 0.0
 

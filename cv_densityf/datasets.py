@@ -70,8 +70,8 @@ class ImagePair:
     points2: NDArray[np.float64]
 
     def __repr__(self) -> str:
-        shapes = " and ".join(f"{w} x {h}" for h, w, _ in (self.image1.shape, self.image2.shape))
-        return f"<ImagePair: {shapes} pixels>"
+        (h1, w1), (h2, w2) = self.image1.shape[:2], self.image2.shape[:2]
+        return f"<ImagePair: {w1} x {h1} and {w2} x {h2} pixels>"
 
     def error(self, F: ArrayLike | None) -> float:
         """Mean distance of the true correspondences to the epipolar lines of ``F``.

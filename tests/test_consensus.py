@@ -1024,13 +1024,14 @@ def turntable(seed, n=400, share=0.75):
 @pytest.mark.parametrize("majority", [False, True])
 def test_most_matches_win_over_fewer_that_are_spread(majority):
     """Cell by cell the background has more votes; but it is a quarter of the matches."""
-    errors = []
+    errors, told = [], 0
     for seed in range(12):
         X, judges = turntable(seed)
         found = find(X, majority=majority)
         errors.append(sampson_distance(found.F, judges).mean())
-        assert found.reason.startswith("the hypothesis with the most ")
+        told += "more matches near it than the one with the most votes" in found.reason
     assert max(errors) < 1.0
+    assert told > 6
 
 
 @pytest.mark.parametrize("wrong", [0, 200])
@@ -1061,7 +1062,7 @@ def test_a_few_matches_off_the_plane_do_not_leave_f_open():
         X = np.hstack([first, second[:, :2] / second[:, 2:]]) + rng.normal(0, 0.2, (600, 4))
         reason = find(X).reason
         told += "F open" in reason
-        assert re.search("9[4-6]% .* (F open|F rests on the other [4-6]%)$", reason)
+        assert re.search(r"9[4-6]\.\d% .* (F open|F rests on the other [4-6]\.\d%)$", reason)
     assert told <= 1
 
 

@@ -906,15 +906,18 @@ def test_texture_that_repeats_does_not_win_with_fewer_matches():
 def test_a_lattice_is_known_by_its_step(n, step):
     X = np.random.default_rng(0).uniform(0, [640, 480] * 2, (n, 4))
     whole = np.rint(X / step) * step
-    assert _estimate._lattice_step(whole, 2.0) == pytest.approx(step)
-    assert _estimate._lattice_step(whole, 10.0) == 0.0
+    assert _estimate._lattice_step(whole, 2.0, 20.0) == pytest.approx(step)
+    assert _estimate._lattice_step(whole, 10.0, 20.0) == 0.0
+    assert _estimate._lattice_step(whole, 0.5, 2.0) == 0.0
+    # Of all matches: other ones may come later.
+    assert _estimate._lattice_step(np.vstack([whole.repeat(8, axis=0), X]), 2.0, 20.0) == 0.0
     # A grid in one image alone is where the matcher asked, not what it rounded to.
     for columns in (slice(0, 2), slice(2, 4)):
         mixed = X.copy()
         mixed[:, columns] = whole[:, columns]
-        assert _estimate._lattice_step(mixed, 2.0) == 0.0
-    assert _estimate._lattice_step(X, 2.0) == 0.0
-    assert _estimate._lattice_step(np.ones((300, 4)), 2.0) == 0.0
+        assert _estimate._lattice_step(mixed, 2.0, 20.0) == 0.0
+    assert _estimate._lattice_step(X, 2.0, 20.0) == 0.0
+    assert _estimate._lattice_step(np.ones((300, 4)), 2.0, 20.0) == 0.0
 
 
 @pytest.mark.parametrize("method", ["lmeds", "usac_accurate"])
