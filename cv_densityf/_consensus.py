@@ -74,7 +74,7 @@ _SIGNIFICANT = 2.0
 #: A rival, another motion than the one with the most votes, is taken in its place where the sum of
 #: the matches, each of which counts less the farther it is, is larger by so many standard
 #: deviations of chance. It has to have this part of the other's inliers at least. If most matches
-#: suit the rival, they count within so many medians of its residuals, whose squares are not quite 0.
+#: suit the rival, they count within so many medians of its residuals, which are not quite 0.
 _CLEARLY = 1.25
 _AT_LEAST = 0.85
 _MEDIANS = 2.5
