@@ -575,10 +575,10 @@ def _for_people(report: dict[str, Any], robust: Robust) -> str:
         lines.append(textwrap.fill(text, 79, initial_indent=start, subsequent_indent=indent))
     coherence, n_inliers = report["coherence"], report["n_inliers"]
     # Without a threshold inliers are many whatever F is.
-    told = 2 * n_inliers > n if by_threshold else report["agreed"]
+    trusted = 2 * n_inliers > n if by_threshold else report["agreed"]
     if report["F"] is not None and n_inliers <= MINIMAL + 1:
         lines += ["", f"Some F fits any {MINIMAL} matches: so few inliers say nothing."]
-    elif coherence is not None and coherence < COHERENT and not told:
+    elif coherence is not None and coherence < COHERENT and not trusted:
         lines += ["", "Images that have nothing in common have inliers of such coherence."]
     if report["F"] is not None:
         rows_of_F = ["  " + "".join(f"{value:>18.9e}" for value in row) for row in report["F"]]

@@ -179,9 +179,10 @@ def search(
     lines: a nearly right F has the right one's inliers there. Each hypothesis is polished on all
     matches. The draws end when a second, independent one arrives at the best hypothesis's inliers,
     and one from what these leave, if that is much, is no better; or after `ROUNDS` on each ranking,
-    or where there is no hope. Where most inliers are on a plane, other hypotheses of that plane are
-    then tried. Where no draws agree, and there is hope, the best hypotheses are optimised locally;
-    the winner always is, within its noise.
+    or where there is no hope. Another motion that clearly more matches are near is best, whatever
+    its votes. Where most inliers are on a plane, other hypotheses of that plane are then tried.
+    Where no draws agree, and there is hope, the best hypotheses are optimised locally; the winner
+    always is, within its noise.
 
     Parameters
     ----------
@@ -452,7 +453,7 @@ class _Pool:
             return elected
         off_plane = inliers[:, self._off_plane[rows]]
         gain = off_plane - off_plane[elected]
-        lead = gain.sum(axis=1) - _SIGNIFICANT * np.sqrt(np.abs(gain).sum(axis=1))
+        lead = _lead(gain, _SIGNIFICANT)
         lead[votes < _NEARLY * votes[elected]] = -np.inf
         # Its own lead is 0.
         return int(lead.argmax()) if lead.max() > 0 else elected
@@ -479,7 +480,7 @@ class _Pool:
         width = np.where(near > 0.5 * self._share.sum(), narrow, self.working**2)[:, None]
         gain = np.maximum(1.0 - squared / width, 0.0)
         gain = (gain - np.maximum(1.0 - self._squared[elected] / width, 0.0)) * self._share
-        lead = gain.sum(axis=1) - _CLEARLY * np.sqrt((gain * gain).sum(axis=1))
+        lead = _lead(gain, _CLEARLY)
         best = int(lead.argmax())
         return int(np.flatnonzero(rivals)[best]) if lead[best] > 0.0 else elected
 
@@ -687,6 +688,11 @@ class _Pool:
 def _at_most(size: int, rows: Ints, rng: np.random.Generator) -> Ints:
     """Draw ``size`` of the rows, or take all of fewer."""
     return rows if len(rows) <= size else rng.choice(rows, size, replace=False, shuffle=False)
+
+
+def _lead(gain: Floats, deviations: float) -> Floats:
+    """By how much sums of gains (m, n) exceed so many standard deviations of chance, (m,)."""
+    return np.asarray(gain.sum(axis=1) - deviations * np.sqrt((gain * gain).sum(axis=1)))
 
 
 def _alike(inliers: Floats, one: Floats, overlap: float) -> Bools:
