@@ -110,17 +110,20 @@ def test_cuts_thin_out_the_matches():
         assert set(map(tuple, fewer)) < set(map(tuple, more))
 
 
+def trial(method, cut, seed, threshold, ms):
+    return paper.Trial(
+        "real", cut, "pair", method, seed, 100, threshold, 0.0, ms, own=0.1, truth=0.1, zhang=0.1,
+        inliers=40, drawn_from=100,
+    )  # fmt: skip
+
+
 def test_the_growth_of_ransacs_time_is_over_that_at_the_largest_threshold():
     trials = [
-        paper.Trial(
-            "real", cut, "pair", method, 0, 100, threshold, 0.0,
-            ms=factor * 10 / threshold**power, own=0.1, truth=0.1, zhang=0.1, inliers=40,
-            drawn_from=100,
-        )
+        trial(method, cut, 0, threshold, factor * 10 / threshold**power)
         for power, cut in enumerate(paper.CUTS)
         for threshold, *_ in paper.TABLE_1
         for method, factor in (("RANSAC", 1.0), ("USAC_MAGSAC", threshold))
-    ]  # fmt: skip
+    ]
     (found,) = tables("\n" + paper._growth_table(trials)).values()
     assert found[0][1:-1] == ["th 2.2", "th 1", "th 0.8", "th 0.5"]
     assert found[1][0] == ["the paper", "1.0", "2.2", "7.1", "26.8", ""]
@@ -128,6 +131,31 @@ def test_the_growth_of_ransacs_time_is_over_that_at_the_largest_threshold():
         growth = [(2.2 / threshold) ** power for threshold in (2.2, 1, 0.8, 0.5)]
         cells = [f"{g:.1f} [{g:.1f} to {g:.1f}]" for g in growth]
         assert row == [cut, *cells, "0.40 [0.40 to 0.40]"]
+
+
+def test_times_are_told_by_how_hard_ransac_had_to_work():
+    # Of LMedS, which takes 2 ms whatever the threshold.
+    works = [0.1, 0.5, 0.9, 3.0, 5.0, 7.0]
+    trials = [
+        trial(method, paper.MUTUAL, seed, threshold, ms)
+        for seed, work in enumerate(works)
+        for method, threshold, ms in (
+            ("LMedS", 2.2, 2.0),
+            ("RANSAC", 0.5, 2.0 * work),
+            ("RANSAC", 2.2, 1.0),
+            (paper.DEFAULT, 0.5, 1.0),
+            (paper.PROPOSED, 0.5, 2.0),
+            (paper.PROPOSED_CV2, 0.5, 3.0),
+            (paper.MAGSAC, 0.5, 4.0),
+        )
+    ]
+    ((header, rows),) = tables("\n" + paper._work_table(trials)).values()
+    assert header[3:] == [paper.PROPOSED, paper.PROPOSED_CV2, paper.DEFAULT, paper.MAGSAC]
+    assert [row[1] for row in rows] == ["1", "2", "1", "2"]
+    # The paper's RANSAC took 126 ms, its LMedS 18.2.
+    assert [row[2] for row in rows] == ["", "", "", "0.14"]
+    assert rows[0][5] == "5.000 [5.000 to 5.000]"
+    assert [cell.split()[0] for cell in rows[3][3:]] == ["0.143", "0.214", "0.071", "0.286"]
 
 
 @pytest.mark.parametrize("method", [paper.PROPOSED, paper.PROPOSED_CV2])
