@@ -66,19 +66,20 @@ MAX_DRAW_ITERS = 1000
 #: Two hypotheses agree when their inlier sets have this intersection over union; then there are no
 #: more draws.
 _AGREEMENT = 0.93
-#: Where a plane is dominant, a hypothesis with this share of the most votes, and so many standard
-#: deviations of chance more inliers off the plane, is the better one: these fix F, and are often
-#: sparse and of little reliability. With fewer votes it fits a crowd of wrong ones there.
-_NEARLY = 0.97
-_SIGNIFICANT = 2.0
-#: A rival, another motion than the one with the most votes, is taken in its place where the sum of
-#: the matches, each of which counts less the farther it is, is larger by so many standard
-#: deviations of chance. It has to have this part of the other's inliers at least. If most matches
-#: suit the rival, they count within so many medians of its residuals, which are not quite 0.
+#: Clearly more matches are near a hypothesis than near another one if their sum, in which each
+#: counts less the farther it is, is larger by so many standard deviations of chance. The local
+#: optimisation has many that differ little, and asks for more.
 _CLEARLY = 1.25
+_CLEARLY_OF_MANY = 2.0
+#: Where a plane is dominant, a hypothesis with this share of the most votes that more matches off
+#: the plane are near is the better one: these fix F, and are often sparse and of little
+#: reliability. With fewer votes it fits a crowd of wrong ones there.
+_NEARLY = 0.96
+#: A rival, another motion than the one with the most votes, is taken in its place if clearly more
+#: matches are near it, within so many robust standard deviations of the residuals, the larger ones
+#: of the two. It has to have this part of the other's inliers at least.
+_RIVAL_SIGMAS = 2.0
 _AT_LEAST = 0.85
-_MEDIANS = 2.5
-_EXACT = 1e-30
 #: Working thresholds within which a match is on a plane.
 _PLANE_WIDTH = 2.0
 #: With more than this share of the inliers on a plane the reason says so. F is open if those off it
@@ -438,25 +439,32 @@ class _Pool:
         self._inliers = np.concatenate([self._inliers, self._inliers_by(squared)])
         self.votes = np.concatenate([self.votes, votes])
         self._sizes = np.concatenate([self._sizes, sizes])
-        self.best = self._for_more(self._elected(self.votes, self._inliers))
+        self.best = self._for_more(self._elected(self.votes, self._squared, self.working))
 
     def _inliers_by(self, squared: Floats) -> Floats:
         return (squared < self.working**2).astype(np.float32)
 
-    def _elected(self, votes: Floats, inliers: Floats, rows: Ints | slice = slice(None)) -> int:
-        """Index of the most votes (m,), or of nearly as many and more inliers off a dominant plane.
+    def _elected(
+        self,
+        votes: Floats,
+        squared: Floats,
+        width: float,
+        deviations: float = _CLEARLY,
+        rows: Ints | slice = slice(None),
+    ) -> int:
+        """Index of the most votes (m,), or of nearly as many and more matches off a dominant plane.
 
-        ``inliers`` (m, k) are of the given rows.
+        ``squared`` residuals (m, k) are of the given rows; ``deviations`` tell how clearly more.
         """
         elected = int(votes.argmax())
         if self._off_plane is None:
             return elected
-        off_plane = inliers[:, self._off_plane[rows]]
-        gain = off_plane - off_plane[elected]
-        lead = _lead(gain, _SIGNIFICANT)
-        lead[votes < _NEARLY * votes[elected]] = -np.inf
+        nearly = np.flatnonzero(votes >= _NEARLY * votes[elected])
+        off_plane = np.flatnonzero(self._off_plane[rows])
+        squared, share = squared[:, off_plane], self._share[rows][off_plane]
+        lead = _lead(squared[nearly], squared[elected], width, share, deviations)
         # Its own lead is 0.
-        return int(lead.argmax()) if lead.max() > 0 else elected
+        return int(nearly[lead.argmax()]) if lead.max() > 0.0 else elected
 
     def _for_more(self, elected: int) -> int:
         """Index of another motion that clearly more matches suit than the elected; or of that.
@@ -472,15 +480,10 @@ class _Pool:
         rivals &= numbers > _AT_LEAST * numbers[elected]
         if not rivals.any():
             return elected
-        squared = self._squared[rivals]
-        # Where most matches suit it, these tell the noise, and what else is near is by chance.
-        near = times_vector((squared < self.threshold**2).astype(np.float32), self._share)
-        median = np.partition(squared, len(self._X) // 2)[:, len(self._X) // 2]
-        narrow = np.clip(_MEDIANS**2 * median, _EXACT, self.threshold**2)
-        width = np.where(near > 0.5 * self._share.sum(), narrow, self.working**2)[:, None]
-        gain = np.maximum(1.0 - squared / width, 0.0)
-        gain = (gain - np.maximum(1.0 - self._squared[elected] / width, 0.0)) * self._share
-        lead = _lead(gain, _CLEARLY)
+        squared = self._squared[[elected, *np.flatnonzero(rivals)]]
+        noise = np.array([_noise(row, self.threshold) for row in squared])
+        width = _RIVAL_SIGMAS * np.maximum(noise, max(noise[0], _NARROWEST * self.threshold))
+        lead = _lead(squared[1:], squared[0], width[1:, None], self._share, _CLEARLY)
         best = int(lead.argmax())
         return int(np.flatnonzero(rivals)[best]) if lead[best] > 0.0 else elected
 
@@ -570,8 +573,7 @@ class _Pool:
         several = polish(part, several, [_POLISH_WIDTH * width] * _LOCAL_STEPS)
         squared = part.sampson(several)
         votes = self._ballot.part(rows).count(squared, width) * _credit(several)
-        inliers = (squared < width**2).astype(np.float32)
-        return np.asarray(several[self._elected(votes, inliers, rows)])
+        return np.asarray(several[self._elected(votes, squared, width, _CLEARLY_OF_MANY, rows)])
 
     @property
     def planar(self) -> tuple[float, bool]:
@@ -589,8 +591,8 @@ class _Pool:
         """What the best hypothesis has most of."""
         if self.best == self.votes.argmax():
             return "the most votes"
-        if self.best == self._elected(self.votes, self._inliers):
-            return "the most inliers off a dominant plane"
+        if self.best == self._elected(self.votes, self._squared, self.working):
+            return "more matches near it, off a dominant plane, than the one with the most votes"
         return "more matches near it than the one with the most votes"
 
     def agrees_independently(self) -> bool:
@@ -690,8 +692,15 @@ def _at_most(size: int, rows: Ints, rng: np.random.Generator) -> Ints:
     return rows if len(rows) <= size else rng.choice(rows, size, replace=False, shuffle=False)
 
 
-def _lead(gain: Floats, deviations: float) -> Floats:
-    """By how much sums of gains (m, n) exceed so many standard deviations of chance, (m,)."""
+def _lead(
+    squared: Floats, one: Floats, width: float | Floats, share: Floats, deviations: float
+) -> Floats:
+    """By how much clearly more matches are near hypotheses (m, n) than near another one (n,), (m,).
+
+    A match counts its share less the farther it is, up to a width.
+    """
+    gain = np.maximum(1.0 - squared / width**2, 0.0) - np.maximum(1.0 - one / width**2, 0.0)
+    gain *= share
     return np.asarray(gain.sum(axis=1) - deviations * np.sqrt((gain * gain).sum(axis=1)))
 
 
