@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from cv_densityf._epipolar import (
     shift,
 )
 from cv_densityf._parallax import FEWEST, plane_and_parallax
-from cv_densityf._prefilter import COHERENT, coherence, grouped, place_numbers, turns
+from cv_densityf._prefilter import COHERENT, coherence, grouped, place_numbers, ranks, turns
 from cv_densityf._stopwatch import Stopwatch
 
 Floats = NDArray[np.floating]
@@ -231,7 +232,8 @@ def search(
     for ranking, together in rankings:
         order = np.argsort(-ranking, kind="stable")[: np.count_nonzero(ranking >= 0.0)]
         reliable = order[: max(MIN_DRAW, len(order) // 2)]
-        latest = _Pool(X, np.nan_to_num(ranking, nan=0.5), reliable, threshold, rng, frame)
+        weights = np.nan_to_num(ranking, nan=0.5)
+        latest = _Pool(X, weights, reliable, threshold, rng, frame, scores)
         made, agreed, hopeless = _fill(
             latest, X, order, together, scores, confidence, max_iters, seed + n_draws, watch
         )
@@ -386,6 +388,7 @@ class _Pool:
         threshold: float,
         rng: np.random.Generator,
         frame: Frame | None = None,
+        scores: Floats | None = None,
     ) -> None:
         self.threshold = threshold
         self.working = threshold
@@ -401,6 +404,7 @@ class _Pool:
         self._share = (1.0 / _claimants(X)).astype(np.float32)
         self._reliability = reliability = reliability * self._share
         self._reliable = reliable
+        self._scores = scores
         self._rng = rng
         self._frame = frame or Frame(X)
         # What lies far out must not make the cells so large that all others share one.
@@ -466,6 +470,13 @@ class _Pool:
         # Its own lead is 0.
         return int(nearly[lead.argmax()]) if lead.max() > 0.0 else elected
 
+    @cached_property
+    def _trusted_share(self) -> Floats:
+        """What a match counts where motions are compared: the caller may trust one of them more."""
+        if self._scores is None:
+            return self._share
+        return self._share * ranks(self._scores).astype(np.float32)
+
     def _for_more(self, elected: int) -> int:
         """Index of another motion that clearly more matches suit than the elected; or of that.
 
@@ -476,14 +487,15 @@ class _Pool:
         rivals = ~_alike(self._inliers, self._inliers[elected], _SAME_BASIN)
         if not rivals.any():
             return elected
-        numbers = times_vector(self._inliers, self._share)
+        share = self._trusted_share
+        numbers = times_vector(self._inliers, share)
         rivals &= numbers > _AT_LEAST * numbers[elected]
         if not rivals.any():
             return elected
         squared = self._squared[[elected, *np.flatnonzero(rivals)]]
         noise = np.array([_noise(row, self.threshold) for row in squared])
         width = _RIVAL_SIGMAS * np.maximum(noise, max(noise[0], _NARROWEST * self.threshold))
-        lead = _lead(squared[1:], squared[0], width[1:, None], self._share, _CLEARLY)
+        lead = _lead(squared[1:], squared[0], width[1:, None], share, _CLEARLY)
         best = int(lead.argmax())
         return int(np.flatnonzero(rivals)[best]) if lead[best] > 0.0 else elected
 

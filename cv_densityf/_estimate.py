@@ -42,11 +42,15 @@ MAX_RANKED = 1_000
 FEW_RANKED = 250
 #: The noise is the data's, and the caller's threshold rules the mask: the search has this part of
 #: the points' spread for its threshold, 1 to 3 px in a photograph, as far as it is within this
-#: factor of the caller's; below half of it, right matches may not agree any more. Few matches get
-#: more, by this over their number: of these each that is right counts.
+#: factor of the caller's; below half of it, right matches may not agree any more. It is no more
+#: than so many pixels: the noise of a large image is no larger, and there wrong matches a few
+#: pixels off would pass. Points of more spread than those of any image are not in pixels. Few
+#: matches get more, by this over their number: of these each that is right counts.
 _SEARCH_THRESHOLD = 0.01
-_MORE_FOR_FEW = 0.25
 _LEEWAY = 2.0
+_MOST_PIXELS = 3.0
+_NO_PIXELS = 1e4
+_MORE_FOR_FEW = 25.0
 #: Points that were rounded to a lattice have this part of its step for a threshold at least: they
 #: are off by up to half of it, and there are wrong matrices that suit many of them exactly. So many
 #: tell whether there is one, by gaps that are whole multiples of the step but for so much.
@@ -98,7 +102,7 @@ class Estimate:
         for those of a dominant plane and, where no draws agreed, of the local optimisation. What
         the best of them becomes after that has none, nor has the draw that only ``"lmeds"`` makes.
         Of many matches, those of the part that searched. Where a plane is dominant, the best one's
-        may be 3 % less than the largest: among these the number of inliers off the plane decides.
+        may be 4 % less than the largest: among these the matches near it off the plane decide.
         And it may be far less where clearly more matches are near another motion.
 
     See Also
@@ -173,11 +177,14 @@ def _estimate(
         return plain(f"fewer than {MIN_FILTERED} finite matches")
     if density == "off" or robust.direct:
         return plain("density is off" if density == "off" else f"{robust.name} takes no filter")
+    trust = scores
+    if trust is None and robust.best_first:
+        trust = -np.arange(n, dtype=np.float64)
     heard = rows
     if len(rows) > MAX_SEARCHED:
         rng = np.random.default_rng(abs(seed))
         heard = rows[_some(len(rows), MAX_REFINED, rng)]
-        rows = heard[_some(len(heard), MAX_SEARCHED, rng)]
+        rows = heard[_searched(len(heard), None if trust is None else trust[heard], rng)]
     Z = X[rows] if len(rows) < n else X
     about = middle(Z)
     on_a_line, sizes = _shape(Z, about)
@@ -189,9 +196,8 @@ def _estimate(
         units = max(sizes) / sizes
         Z = Z * units.repeat(2)
         about = middle(Z)
-    trust = None if scores is None else scores[rows]
-    if trust is None and robust.best_first:
-        trust = -rows.astype(np.float64)
+    if trust is not None:
+        trust = trust[rows]
     asked: dict[str, Any] = {
         "threshold": _search_threshold(about[1], len(Z), robust, density),
         "confidence": robust.confidence,
@@ -270,7 +276,10 @@ def threshold_doubt(threshold: float, spread: float, derived: bool) -> str:
 
 
 def _search_threshold(spread: float, n: int, robust: Robust, density: str) -> float:
-    own = (_SEARCH_THRESHOLD + _MORE_FOR_FEW / n) * spread
+    own = _SEARCH_THRESHOLD * spread
+    if spread < _NO_PIXELS:
+        own = min(own, _MOST_PIXELS)
+    own *= 1.0 + _MORE_FOR_FEW / n
     if robust.rule == "lmeds":  # takes none from the caller
         return own
     if density == "paper":  # th of its step 5
@@ -315,6 +324,22 @@ def _rankings(
     reliability, _, together = contrast_support(X, trust)
     watch.lap("density")
     yield reliability, together
+
+
+def _searched(
+    n: int, scores: NDArray[np.float64] | None, rng: np.random.Generator
+) -> NDArray[np.intp]:
+    """Draw the rows of n that are searched: at random, but with scores half of them are the best.
+
+    A few right matches among very many are likely to be there.
+    """
+    if scores is None:
+        return _some(n, MAX_SEARCHED, rng)
+    worst_first = np.argsort(scores, kind="stable")
+    half = MAX_SEARCHED // 2
+    others = worst_first[:-half]
+    others = others[_some(len(others), MAX_SEARCHED - half, rng)]
+    return np.sort(np.concatenate([worst_first[-half:], others]))
 
 
 def _some(n: int, size: int, rng: np.random.Generator) -> NDArray[np.intp]:

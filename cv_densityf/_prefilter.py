@@ -35,8 +35,9 @@ _COHERENCE_OF = 5_000
 KEPT = 0.5
 #: Of the caller's scores the worst part, one match in so many, is no witness for others.
 _WORST = 5
-#: Where a place holds more than one point in so many, copies are looked for.
-_MANY_COPIES = 10
+#: Where a place holds more than one point in so many, and a few, copies are looked for.
+_MANY_COPIES = 25
+_FEW_COPIES = 2
 #: Rows compared at a time, so that the comparison table stays in the cache.
 _CHUNK = 4096
 
@@ -117,10 +118,10 @@ def density_contrast(
 
 
 def place_numbers(points: Floats) -> Ints | None:
-    """Give points (n, 2) the number of their place; None if no place has a tenth of them."""
+    """Give points (n, 2) the number of their place; None if no place has a good part of them."""
     n = len(points)
     x = np.sort(points[:, 0])
-    many = n // _MANY_COPIES
+    many = _FEW_COPIES + n // _MANY_COPIES
     if not (x[many:] == x[: n - many]).any():
         return None
     # As complex numbers they are sorted several times as fast as by rows.

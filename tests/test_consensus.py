@@ -183,10 +183,10 @@ def test_cameras_that_can_exist_win_over_a_few_more_votes(seed, monkeypatch):
     low, high = scene.X.min(axis=0), scene.X.max(axis=0)
     while True:
         F, others = impossible(rng, rng.uniform(low, high, (500, 4)))
-        if len(others) > 110:
+        if len(others) > 105:
             break
     # Strays, so that neither has the majority.
-    X = np.vstack([scene.X, others[:110], rng.uniform(low, high, (60, 4))])
+    X = np.vstack([scene.X, others[:105], rng.uniform(low, high, (60, 4))])
     everyone = np.arange(len(X))
 
     def winner():
@@ -520,14 +520,14 @@ def test_one_plane_does_not_win(seed, inlier_ratio, share):
     assert np.median(sampson_distance(find(X).F, judges)) < 1.5
 
 
-@pytest.mark.parametrize(("more", "votes", "best"), [(3, 98, 0), (8, 98, 1), (8, 96, 0)])
-def test_on_a_plane_significantly_more_off_it_are_better_than_a_few_votes(more, votes, best):
+@pytest.mark.parametrize(("more", "votes", "best"), [(1, 98, 0), (3, 98, 1), (8, 95, 0)])
+def test_on_a_plane_clearly_more_off_it_are_better_than_a_few_votes(more, votes, best):
     """They may be of no reliability, but a crowd of wrong ones costs votes elsewhere."""
     squared = np.full((2, 60), 9.0)
     squared[0, :40] = squared[1, : 40 + more] = 0.0
     pool = elected(squared, votes, off_plane=np.arange(60) >= 38)
     assert pool.best == best
-    assert pool.virtue == ("the most votes", "the most inliers off a dominant plane")[best]
+    assert ("off a dominant plane" in pool.virtue) == (best == 1)
     assert elected(squared, votes, off_plane=None).best == 0
 
 
