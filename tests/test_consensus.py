@@ -1034,6 +1034,18 @@ def test_most_matches_win_over_fewer_that_are_spread(majority):
     assert told > 6
 
 
+@pytest.mark.parametrize(("n", "best"), [(38, 0), (60, 1)])
+def test_a_rival_is_not_better_for_being_tighter(n, best):
+    """Another motion with more votes has 40 matches at four times its noise."""
+    rng = np.random.default_rng(0)
+    squared = np.full((2, 100), 100.0)
+    squared[0, :40] = rng.normal(0, 0.4, 40) ** 2
+    squared[1, 40 : 40 + n] = rng.normal(0, 0.1, n) ** 2
+    pool = _Pool(true_matches(0, 100), np.ones(100), np.arange(100), 2.0, rng)
+    pool._append(np.ones((2, 3, 3)), squared, np.array([100.0, 80.0]), [30, 60])
+    assert pool.best == best
+
+
 @pytest.mark.parametrize("wrong", [0, 200])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_reason_tells_of_matches_that_leave_f_open(seed, wrong):

@@ -892,6 +892,63 @@ def test_the_searchs_threshold_is_a_hundredth_of_the_spread_near_the_callers(
         assert _estimate._search_threshold(300.0, n, robust, "paper") == threshold
 
 
+@pytest.mark.parametrize(("spread", "searched"), [(1_200.0, 3.0), (20_000.0, 200.0)])
+def test_the_searchs_threshold_is_a_few_pixels_if_these_are_pixels(spread, searched):
+    """LMEDS takes none from the caller."""
+    robust = Robust(cv2.FM_LMEDS, 3.0, 0.99, 1000)
+    assert _estimate._search_threshold(spread, 10**9, robust, "contrast") == pytest.approx(searched)
+
+
+@pytest.mark.parametrize("method", ["lmeds", "usac_accurate"])
+def test_in_large_images_near_misses_are_wrong_matches(method):
+    """Two in five are 2 to 6 px beside their line, where the others are a fifth of a pixel off."""
+    errors = []
+    for seed in range(6):
+        scene = scene_of(seed, 500, 1.0, 0.0)
+        rng = np.random.default_rng(seed)
+        lines = np.hstack([scene.points1, np.ones((500, 1))]) @ scene.F.T
+        normals = lines[:, :2] / np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
+        truth = 4.0 * scene.X
+        X = truth + rng.normal(0, 0.2, (500, 4))
+        X[:200, 2:] += rng.uniform(2, 6, (200, 1)) * normals[:200]
+        errors.append(sampson_distance(estimate(X, method=method).F, truth).mean())
+    assert np.median(errors) < 0.15
+
+
+@pytest.mark.parametrize("by", ["scores", "order"])
+def test_of_two_motions_the_more_trusted_one_wins(by):
+    """Of 210 matches, not of 270 others: their scores are a standard deviation higher."""
+    errors = {True: [], False: []}
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        right = scene_of(seed, 210, 1.0)
+        X = np.vstack([right.X, scene_of(50 + seed, 390, 270 / 390).X])
+        scores = rng.normal(0, 1, 600)
+        for told in (True, False):
+            scores[:210] += told
+            order = np.argsort(-scores) if by == "order" else rng.permutation(600)
+            asked = {"method": "usac_prosac"} if by == "order" else {"scores": scores[order]}
+            errors[told].append(sampson_distance(estimate(X[order], **asked).F, right.X).mean())
+            scores[:210] -= told
+    assert np.mean(np.array(errors[True]) < 1.0) > 0.7
+    assert np.mean(np.array(errors[False]) < 1.0) < 0.3
+
+
+@pytest.mark.parametrize("by", ["scores", "order"])
+def test_of_very_many_matches_the_best_scored_are_searched(by):
+    """Of 200 right ones among 20,000, a random quarter are too few to be found."""
+    errors = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        scene = scene_of(seed, 20_000, 0.01)
+        scores = rng.normal(0, 1, 20_000) + 4.0 * scene.inliers
+        order = np.argsort(-scores) if by == "order" else np.arange(20_000)
+        asked = {"method": "usac_prosac"} if by == "order" else {"scores": scores}
+        F = estimate(scene.X[order], **asked).F
+        errors.append(np.median(sampson_distance(F, scene.X[scene.inliers])))
+    assert max(errors) < 1.0
+
+
 def test_texture_that_repeats_does_not_win_with_fewer_matches():
     """It has more votes: there are 350 such matches, dense and all over the wall, for 600 right."""
     errors = []
