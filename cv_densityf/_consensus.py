@@ -72,9 +72,9 @@ _AGREEMENT = 0.93
 #: optimisation has many that differ little, and asks for more.
 _CLEARLY = 1.25
 _CLEARLY_OF_MANY = 2.0
-#: Where a plane is dominant, a hypothesis with this share of the most votes that more matches off
-#: the plane are near is the better one: these fix F, and are often sparse and of little
-#: reliability. With fewer votes it fits a crowd of wrong ones there.
+#: Where a plane is dominant, a hypothesis with this share of the most votes that clearly more
+#: matches off the plane are near, and no fewer in all, is the better one: these fix F, and are
+#: often sparse and of little reliability. With fewer votes it fits a crowd of wrong ones there.
 _NEARLY = 0.96
 #: A rival, another motion than the one with the most votes, is taken in its place if clearly more
 #: matches are near it, within so many robust standard deviations of the residuals, the larger ones
@@ -464,9 +464,9 @@ class _Pool:
         if self._off_plane is None:
             return elected
         nearly = np.flatnonzero(votes >= _NEARLY * votes[elected])
-        off_plane = np.flatnonzero(self._off_plane[rows])
-        squared, share = squared[:, off_plane], self._share[rows][off_plane]
-        lead = _lead(squared[nearly], squared[elected], width, share, deviations)
+        gain = _gain(squared[nearly], squared[elected], width) * self._share[rows]
+        lead = _lead(gain[:, self._off_plane[rows]], deviations)
+        lead[gain.sum(axis=1) < 0.0] = -np.inf
         # Its own lead is 0.
         return int(nearly[lead.argmax()]) if lead.max() > 0.0 else elected
 
@@ -495,7 +495,7 @@ class _Pool:
         squared = self._squared[[elected, *np.flatnonzero(rivals)]]
         noise = np.array([_noise(row, self.threshold) for row in squared])
         width = _RIVAL_SIGMAS * np.maximum(noise, max(noise[0], _NARROWEST * self.threshold))
-        lead = _lead(squared[1:], squared[0], width[1:, None], share, _CLEARLY)
+        lead = _lead(_gain(squared[1:], squared[0], width[1:, None]) * share, _CLEARLY)
         best = int(lead.argmax())
         return int(np.flatnonzero(rivals)[best]) if lead[best] > 0.0 else elected
 
@@ -704,15 +704,14 @@ def _at_most(size: int, rows: Ints, rng: np.random.Generator) -> Ints:
     return rows if len(rows) <= size else rng.choice(rows, size, replace=False, shuffle=False)
 
 
-def _lead(
-    squared: Floats, one: Floats, width: float | Floats, share: Floats, deviations: float
-) -> Floats:
-    """By how much clearly more matches are near hypotheses (m, n) than near another one (n,), (m,).
+def _gain(squared: Floats, one: Floats, width: float | Floats) -> Floats:
+    """How much nearer matches are to hypotheses (m, n) than to one (n,), on a scale of a width."""
+    near, before = (np.maximum(1.0 - s / width**2, 0.0) for s in (squared, one))
+    return np.asarray(near - before)
 
-    A match counts its share less the farther it is, up to a width.
-    """
-    gain = np.maximum(1.0 - squared / width**2, 0.0) - np.maximum(1.0 - one / width**2, 0.0)
-    gain *= share
+
+def _lead(gain: Floats, deviations: float) -> Floats:
+    """By how much sums of gains (m, n) exceed so many standard deviations of chance, (m,)."""
     return np.asarray(gain.sum(axis=1) - deviations * np.sqrt((gain * gain).sum(axis=1)))
 
 

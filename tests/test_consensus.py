@@ -537,6 +537,14 @@ def test_on_a_plane_what_differs_on_it_does_not_count():
     assert elected(squared, 98, off_plane=np.arange(60) >= 44).best == 1
 
 
+@pytest.mark.parametrize(("fewer", "best"), [(6, 1), (12, 0)])
+def test_what_fewer_matches_are_near_in_all_does_not_win_off_the_plane(fewer, best):
+    """Where the parallax is no larger than the noise, that is what is off the plane."""
+    squared = np.full((2, 60), 9.0)
+    squared[0, :40] = squared[1, fewer:40] = squared[1, 44:52] = 0.0
+    assert elected(squared, 98, off_plane=np.arange(60) >= 44).best == best
+
+
 def test_of_the_same_inliers_off_the_plane_those_with_more_votes_win():
     squared = np.full((2, 60), 9.0)
     squared[:, :40] = 0.0
