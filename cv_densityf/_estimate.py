@@ -449,9 +449,9 @@ def estimate_fundamental(
     threshold : float
         Largest residual of an inlier, pixels, in (1e-12, 1e6); unused by ``"lmeds"``, which finds
         its own. It rules the mask: the search has one of its own, a hundredth of the points'
-        spread and, of n matches, a quarter of an n-th, brought to within a factor of two of this
-        one, but never below half of its own, nor below .8 steps of a lattice that all points are
-        on; ``density="paper"`` takes this one.
+        spread, up to 3 px, and of few matches more, brought to within a factor of two of this one,
+        but never below half of its own, nor below .8 steps of a lattice that all points are on;
+        ``density="paper"`` takes this one.
     confidence : float
         Of each draw to have found the best model, in (0, 1).
     max_iters : int

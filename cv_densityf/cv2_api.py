@@ -205,18 +205,19 @@ def findFundamentalMat(
 
     Notes
     -----
-    On the default path the threshold, the confidence and the seed of ``params`` count, its sampler
-    only as far as PROSAC's means that the rows come best first. The threshold rules the mask; the
-    search has one of its own, a hundredth of the points' spread and, of n matches, a quarter of an
-    n-th, brought to within a factor of two of it, but never below half of its own, nor below .8
-    steps of a lattice that all points are on. There are up to sixteen draws, twice as many for more
-    than 1,000 matches, and one more for ``FM_LMEDS``; each ends after at most ``maxIters`` and a
-    thousand samples.
+    On the default path the threshold, the confidence and the seed of ``params`` count, its
+    sampler only as far as PROSAC's means that the rows come best first. The threshold rules the
+    mask; the search has one of its own, a hundredth of the points' spread, up to 3 px, and of
+    few matches more, brought to within a factor of two of it, but never below half of its own,
+    nor below .8 steps of a lattice that all points are on. There are up to sixteen draws, twice
+    as many for more than 1,000 matches, and one more for ``FM_LMEDS``; each ends after at most
+    ``maxIters`` and a thousand samples.
     ``density="paper"`` draws at the threshold given, and up to ``maxIters`` samples.
 
-    Of more than 1,000 matches density looks at a seeded 1,000, without ``scores`` at 250 if most of
-    these are right, or at all if they lead to no agreement, and of more than 5,000 a seeded 5,000
-    are searched; up to 100,000 choose and refine the result, and the mask is over all.
+    Of more than 1,000 matches density looks at a seeded 1,000, without ``scores`` at 250 if
+    most of these are right, or at all if they lead to no agreement, and of more than 5,000 a
+    seeded 5,000 are searched, half of them the best-scored, if there are ``scores``; up to
+    100,000 choose and refine the result, and the mask is over all.
 
     Deliberate differences from cv2: where ``FM_RANSAC`` and ``FM_LMEDS`` find no model cv2 returns
     uninitialised memory as the mask; there, and with ``cv2.UsacParams``, it leaves a given ``mask``

@@ -445,9 +445,8 @@ class FundamentalMatrixEstimator(MetaEstimatorMixin, BaseEstimator):  # type: ig
     threshold : float in (1e-12, 1e6), default=1.0
         Largest distance of an inlier, in pixels. "lmeds" finds its own. It rules the masks: the
         search of ``prefilter="auto"`` has a threshold of its own, a hundredth of the points'
-        spread and, of n matches, a quarter of an n-th, brought to within a factor of two of this
-        one, but never below half of its own, nor below .8 steps of a lattice that all points are
-        on.
+        spread, up to 3 px, and of few matches more, brought to within a factor of two of this one,
+        but never below half of its own, nor below .8 steps of a lattice that all points are on.
     confidence : float in (0, 1), default=0.999
         Of each draw to have found the best model.
     max_iters : int in [1, 2^31), default=5000
