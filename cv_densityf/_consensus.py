@@ -78,9 +78,10 @@ _CLEARLY_OF_MANY = 2.0
 _NEARLY = 0.96
 #: A rival, another motion than the one with the most votes, is taken in its place if clearly more
 #: matches are near it, within so many robust standard deviations of the residuals, the larger ones
-#: of the two. It has to have this part of the other's inliers at least.
+#: of the two. It has to have this part of the other's inliers at least. If the other has this part
+#: of its inliers, too, each match counts by its score.
 _RIVAL_SIGMAS = 2.0
-_AT_LEAST = 0.85
+_AT_LEAST = 0.7
 #: Working thresholds within which a match is on a plane.
 _PLANE_WIDTH = 2.0
 #: With more than this share of the inliers on a plane the reason says so. F is open if those off it
@@ -172,6 +173,7 @@ def search(
     about: tuple[Floats, float] | None = None,
     scores: Floats | None = None,
     others: Floats | None = None,
+    other_scores: Floats | None = None,
     majority: bool = False,
 ) -> Consensus | None:
     """Search for the fundamental matrix that the reliable and well spread matches vote for.
@@ -208,10 +210,12 @@ def search(
         What `middle` says of X, if it is known.
     scores : array, shape (n,), optional
         The caller's trust in each match: one more draw in three of the rounds takes its samples in
-        this order, whatever the density says.
+        this order, whatever the density says. And it decides between motions of like size.
     others : array, shape (k, 4), optional
         Matches that are not searched: with the rest they vote on the best hypotheses, and polish
         the winner.
+    other_scores : array, shape (k,), optional
+        Their scores.
     majority : bool
         Whether what most matches agree on closely is wanted, as from LMEDS, rather than what as
         many as possible agree on within the threshold. One more draw is at their noise then.
@@ -262,7 +266,7 @@ def search(
         n_draws += 1
         watch.lap("draws")
     G = pool.optimised_best(drawn)
-    F = pool.refined(G) if others is None else pool.settled_by(others - centre, G)
+    F = pool.refined(G) if others is None else pool.settled_by(others - centre, other_scores, G)
     # On its way it may have gone over to matches that no other draw has seen.
     agreed = agreed and pool.best_has_inliers_of(F)
     F = shift(-centre[2:]).T @ F @ shift(-centre[:2])
@@ -463,7 +467,7 @@ class _Pool:
         elected = int(votes.argmax())
         if self._off_plane is None:
             return elected
-        nearly = np.flatnonzero(votes >= _NEARLY * votes[elected])
+        nearly = np.flatnonzero(~(votes < _NEARLY * votes[elected]))
         gain = _gain(squared[nearly], squared[elected], width) * self._share[rows]
         lead = _lead(gain[:, self._off_plane[rows]], deviations)
         lead[gain.sum(axis=1) < 0.0] = -np.inf
@@ -471,14 +475,14 @@ class _Pool:
         return int(nearly[lead.argmax()]) if lead.max() > 0.0 else elected
 
     @cached_property
-    def _trusted_share(self) -> Floats:
-        """What a match counts where motions are compared: the caller may trust one of them more."""
-        if self._scores is None:
-            return self._share
-        return self._share * ranks(self._scores).astype(np.float32)
+    def _trust(self) -> Floats | None:
+        """The rank of each match by score, where there are scores."""
+        return None if self._scores is None else ranks(self._scores)
 
     def _for_more(self, elected: int) -> int:
         """Index of another motion that clearly more matches suit than the elected; or of that.
+
+        With scores, of motions of like size, it is the one that clearly better matches suit.
 
         Votes count crowds less, and a crowd may be the larger part: an object before a background
         that has a motion, or none, of its own. What is spread then leaves F free to suit a part of
@@ -487,15 +491,17 @@ class _Pool:
         rivals = ~_alike(self._inliers, self._inliers[elected], _SAME_BASIN)
         if not rivals.any():
             return elected
-        share = self._trusted_share
-        numbers = times_vector(self._inliers, share)
+        numbers = times_vector(self._inliers, self._share)
         rivals &= numbers > _AT_LEAST * numbers[elected]
         if not rivals.any():
             return elected
         squared = self._squared[[elected, *np.flatnonzero(rivals)]]
         noise = np.array([_noise(row, self.threshold) for row in squared])
         width = _RIVAL_SIGMAS * np.maximum(noise, max(noise[0], _NARROWEST * self.threshold))
-        lead = _lead(_gain(squared[1:], squared[0], width[1:, None]) * share, _CLEARLY)
+        gain = _gain(squared[1:], squared[0], width[1:, None]) * self._share
+        if self._trust is not None:
+            gain[numbers[rivals] < numbers[elected] / _AT_LEAST] *= self._trust
+        lead = _lead(gain, _CLEARLY)
         best = int(lead.argmax())
         return int(np.flatnonzero(rivals)[best]) if lead[best] > 0.0 else elected
 
@@ -605,6 +611,8 @@ class _Pool:
             return "the most votes"
         if self.best == self._elected(self.votes, self._squared, self.working):
             return "more matches near it, off a dominant plane, than the one with the most votes"
+        if self._scores is not None:
+            return "more, or better scored, matches near it than the one with the most votes"
         return "more matches near it than the one with the most votes"
 
     def agrees_independently(self) -> bool:
@@ -684,14 +692,17 @@ class _Pool:
                 break
         return chosen
 
-    def settled_by(self, others: Floats, G: Floats) -> NDArray[np.float64]:
+    def settled_by(self, others: Floats, scores: Floats | None, G: Floats) -> NDArray[np.float64]:
         """Let more matches, all equal, choose among the rivals of G; take the last steps with them.
 
         G stands for the best hypothesis. In pixels, (3, 3).
         """
         rivals = self._finalists(_FINALISTS, _AGREEMENT)[1:]
         X = np.concatenate([self._X, others])
-        wider = _Pool(X, np.ones(len(X)), self._reliable, self.threshold, self._rng)
+        if self._scores is not None and scores is not None:
+            scores = np.concatenate([self._scores, scores])
+        weights = np.ones(len(X))
+        wider = _Pool(X, weights, self._reliable, self.threshold, self._rng, scores=scores)
         wider.working = self.working
         hypotheses = np.concatenate([G[None], self._G[rivals]])
         entered = wider._frame.enter(self._frame.leave(hypotheses))
@@ -705,7 +716,7 @@ def _at_most(size: int, rows: Ints, rng: np.random.Generator) -> Ints:
 
 
 def _gain(squared: Floats, one: Floats, width: float | Floats) -> Floats:
-    """How much nearer matches are to hypotheses (m, n) than to one (n,), on a scale of a width."""
+    """How much nearer matches are to hypotheses (m, n) than to one (n,); 1 at most, 0 if far."""
     near, before = (np.maximum(1.0 - s / width**2, 0.0) for s in (squared, one))
     return np.asarray(near - before)
 

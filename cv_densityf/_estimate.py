@@ -177,14 +177,14 @@ def _estimate(
         return plain(f"fewer than {MIN_FILTERED} finite matches")
     if density == "off" or robust.direct:
         return plain("density is off" if density == "off" else f"{robust.name} takes no filter")
-    trust = scores
+    trust = scores if density != "paper" else None
     if trust is None and robust.best_first:
         trust = -np.arange(n, dtype=np.float64)
     heard = rows
     if len(rows) > MAX_SEARCHED:
         rng = np.random.default_rng(abs(seed))
         heard = rows[_some(len(rows), MAX_REFINED, rng)]
-        rows = heard[_searched(len(heard), None if trust is None else trust[heard], rng)]
+        rows = heard[_some(len(heard), MAX_SEARCHED, rng)]
     Z = X[rows] if len(rows) < n else X
     about = middle(Z)
     on_a_line, sizes = _shape(Z, about)
@@ -196,8 +196,6 @@ def _estimate(
         units = max(sizes) / sizes
         Z = Z * units.repeat(2)
         about = middle(Z)
-    if trust is not None:
-        trust = trust[rows]
     asked: dict[str, Any] = {
         "threshold": _search_threshold(about[1], len(Z), robust, density),
         "confidence": robust.confidence,
@@ -222,12 +220,15 @@ def _estimate(
                     found = replace(found, reliability=peaks)
                 watch.lap("draws")
             else:
-                rankings = _rankings(Z, trust, seed, watch)
-                others = None
+                others = other_scores = None
                 if len(heard) > len(rows):
                     searched = np.zeros(n, dtype=bool)
                     searched[rows] = True
-                    others = X[heard[~searched[heard]]] * units.repeat(2)
+                    rest = heard[~searched[heard]]
+                    others = X[rest] * units.repeat(2)
+                    other_scores = None if trust is None else trust[rest]
+                trust = None if trust is None else trust[rows]
+                rankings = _rankings(Z, trust, seed, watch)
                 found = search(
                     Z,
                     rankings,
@@ -235,6 +236,7 @@ def _estimate(
                     about=about,
                     scores=trust,
                     others=others,
+                    other_scores=other_scores,
                     majority=robust.rule == "lmeds",
                     **asked,
                 )
@@ -324,22 +326,6 @@ def _rankings(
     reliability, _, together = contrast_support(X, trust)
     watch.lap("density")
     yield reliability, together
-
-
-def _searched(
-    n: int, scores: NDArray[np.float64] | None, rng: np.random.Generator
-) -> NDArray[np.intp]:
-    """Draw the rows of n that are searched: at random, but with scores half of them are the best.
-
-    A few right matches among very many are likely to be there.
-    """
-    if scores is None:
-        return _some(n, MAX_SEARCHED, rng)
-    worst_first = np.argsort(scores, kind="stable")
-    half = MAX_SEARCHED // 2
-    others = worst_first[:-half]
-    others = others[_some(len(others), MAX_SEARCHED - half, rng)]
-    return np.sort(np.concatenate([worst_first[-half:], others]))
 
 
 def _some(n: int, size: int, rng: np.random.Generator) -> NDArray[np.intp]:

@@ -118,7 +118,7 @@ def density_contrast(
 
 
 def place_numbers(points: Floats) -> Ints | None:
-    """Give points (n, 2) the number of their place; None if no place has a good part of them."""
+    """Give points (n, 2) the number of their place; None if none can have a good part of them."""
     n = len(points)
     x = np.sort(points[:, 0])
     many = _FEW_COPIES + n // _MANY_COPIES

@@ -216,8 +216,8 @@ def findFundamentalMat(
 
     Of more than 1,000 matches density looks at a seeded 1,000, without ``scores`` at 250 if
     most of these are right, or at all if they lead to no agreement, and of more than 5,000 a
-    seeded 5,000 are searched, half of them the best-scored, if there are ``scores``; up to
-    100,000 choose and refine the result, and the mask is over all.
+    seeded 5,000 are searched; up to 100,000 choose and refine the result, and the mask is over
+    all.
 
     Deliberate differences from cv2: where ``FM_RANSAC`` and ``FM_LMEDS`` find no model cv2 returns
     uninitialised memory as the mask; there, and with ``cv2.UsacParams``, it leaves a given ``mask``

@@ -415,9 +415,9 @@ def test_what_is_optimised_is_what_more_matches_settle_on(monkeypatch):
         made.append(optimised_best(pool, drawn))
         return made[0]
 
-    def settle(pool, others, G):
+    def settle(pool, others, scores, G):
         given.append(G)
-        return settled_by(pool, others, G)
+        return settled_by(pool, others, scores, G)
 
     monkeypatch.setattr(_Pool, "optimised_best", optimise)
     monkeypatch.setattr(_Pool, "settled_by", settle)
@@ -909,7 +909,7 @@ def test_finalists_are_the_best_three_of_different_inliers(seed, monkeypatch):
 
     monkeypatch.setattr(_Pool, "refined", spy)
     pool.working = 1.0
-    pool.settled_by(scene_of(1).X, pool._frame.enter(scene_of(0).F[None])[0])
+    pool.settled_by(scene_of(1).X, None, pool._frame.enter(scene_of(0).F[None])[0])
     (finalists,) = asked
     F = np.concatenate([scene_of(0).F[None], F])
     expected = [0, *(i + 1 for i in expected[1:])]

@@ -149,6 +149,15 @@ def test_a_place_is_where_both_coordinates_are_the_same():
     assert place_numbers(points[100:]) is None
 
 
+@pytest.mark.parametrize(("n", "most"), [(15, 2), (500, 22)])
+def test_copies_are_looked_for_where_one_in_25_may_be_some(n, most):
+    points = np.random.default_rng(0).uniform(0, 900, (n, 2))
+    points[:most] = points[0]
+    assert place_numbers(points) is None
+    points[: most + 1] = points[0]
+    assert np.bincount(place_numbers(points)).max() == most + 1
+
+
 def test_contrast_does_not_depend_on_how_the_work_is_cut(monkeypatch):
     X = scene_of(1, 100).X
     whole = density_contrast(X)
