@@ -78,8 +78,8 @@ _CLEARLY_OF_MANY = 2.0
 _NEARLY = 0.96
 #: A rival, another motion than the one with the most votes, is taken in its place if clearly more
 #: matches are near it, within so many robust standard deviations of the residuals, the larger ones
-#: of the two. It has to have this part of the other's inliers at least. If the other has this part
-#: of its inliers, too, each match counts by its score.
+#: of the two. It has to have this part of the other's inliers at least. Where the other has this
+#: part of its own, too, they are of like size, and each match counts its rank by score.
 _RIVAL_SIGMAS = 2.0
 _AT_LEAST = 0.7
 #: Working thresholds within which a match is on a plane.

@@ -177,9 +177,6 @@ def _estimate(
         return plain(f"fewer than {MIN_FILTERED} finite matches")
     if density == "off" or robust.direct:
         return plain("density is off" if density == "off" else f"{robust.name} takes no filter")
-    trust = scores if density != "paper" else None
-    if trust is None and robust.best_first:
-        trust = -np.arange(n, dtype=np.float64)
     heard = rows
     if len(rows) > MAX_SEARCHED:
         rng = np.random.default_rng(abs(seed))
@@ -220,6 +217,9 @@ def _estimate(
                     found = replace(found, reliability=peaks)
                 watch.lap("draws")
             else:
+                trust = scores
+                if trust is None and robust.best_first:
+                    trust = -np.arange(n, dtype=np.float64)
                 others = other_scores = None
                 if len(heard) > len(rows):
                     searched = np.zeros(n, dtype=bool)

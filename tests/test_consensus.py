@@ -537,6 +537,16 @@ def test_on_a_plane_what_differs_on_it_does_not_count():
     assert elected(squared, 98, off_plane=np.arange(60) >= 44).best == 1
 
 
+@pytest.mark.parametrize(("more", "best"), [(3, 0), (8, 1)])
+def test_of_what_is_optimised_it_takes_more_off_the_plane(more, best):
+    squared = np.full((2, 60), 9.0)
+    squared[0, :40] = squared[1, : 40 + more] = 0.0
+    pool = elected(squared, 98, off_plane=np.arange(60) >= 38)
+    assert pool.best == 1
+    deviations = _consensus._CLEARLY_OF_MANY
+    assert pool._elected(pool.votes, pool._squared, 1.0, deviations) == best
+
+
 @pytest.mark.parametrize(("fewer", "best"), [(6, 1), (12, 0)])
 def test_what_fewer_matches_are_near_in_all_does_not_win_off_the_plane(fewer, best):
     """Where the parallax is no larger than the noise, that is what is off the plane."""
