@@ -119,8 +119,8 @@ _GRID = 16
 _POLISH_WIDTH = 0.7
 _POLISH_STEPS = 2
 _REFINE_STEPS = 2
-#: The noise that what follows the choice of the winner reckons with, at least, in units of the
-#: threshold.
+#: The noise that motions are compared at, and that what follows the choice of the winner reckons
+#: with, at least, in units of the threshold.
 _NARROWEST = 0.03
 #: For the last steps, right matches are counted within so many sigmas of their lines, wrong ones
 #: between these, in each of so many groups of like reliability; and the density of right ones on
@@ -488,22 +488,19 @@ class _Pool:
         that has a motion, or none, of its own. What is spread then leaves F free to suit a part of
         the object as well.
         """
-        rivals = ~_alike(self._inliers, self._inliers[elected], _SAME_BASIN)
-        if not rivals.any():
-            return elected
+        apart = ~_alike(self._inliers, self._inliers[elected], _SAME_BASIN)
         numbers = times_vector(self._inliers, self._share)
-        rivals &= numbers > _AT_LEAST * numbers[elected]
-        if not rivals.any():
+        rivals = np.flatnonzero(apart & (numbers > _AT_LEAST * numbers[elected]))
+        if not len(rivals):
             return elected
-        squared = self._squared[[elected, *np.flatnonzero(rivals)]]
+        squared = self._squared[[elected, *rivals]]
         noise = np.array([_noise(row, self.threshold) for row in squared])
         width = _RIVAL_SIGMAS * np.maximum(noise, max(noise[0], _NARROWEST * self.threshold))
         gain = _gain(squared[1:], squared[0], width[1:, None]) * self._share
         if self._trust is not None:
             gain[numbers[rivals] < numbers[elected] / _AT_LEAST] *= self._trust
         lead = _lead(gain, _CLEARLY)
-        best = int(lead.argmax())
-        return int(np.flatnonzero(rivals)[best]) if lead[best] > 0.0 else elected
+        return int(rivals[lead.argmax()]) if lead.max() > 0.0 else elected
 
     def _poll(self, G: Floats) -> tuple[Floats, Floats]:
         """Squared residuals (m, n) of hypotheses and the votes for them (m,)."""
@@ -610,10 +607,12 @@ class _Pool:
         if self.best == self.votes.argmax():
             return "the most votes"
         if self.best == self._elected(self.votes, self._squared, self.working):
-            return "more matches near it, off a dominant plane, than the one with the most votes"
-        if self._scores is not None:
-            return "more, or better scored, matches near it than the one with the most votes"
-        return "more matches near it than the one with the most votes"
+            more = "more matches near it, off a dominant plane,"
+        elif self._scores is None:
+            more = "more matches near it"
+        else:
+            more = "more, or better scored, matches near it"
+        return f"{more} than the one with the most votes"
 
     def agrees_independently(self) -> bool:
         """Whether draws that no hypothesis had a say in agree, off a dominant plane as well."""
