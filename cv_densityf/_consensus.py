@@ -23,7 +23,15 @@ from cv_densityf._epipolar import (
     shift,
 )
 from cv_densityf._parallax import FEWEST, plane_and_parallax
-from cv_densityf._prefilter import COHERENT, coherence, grouped, place_numbers, ranks, turns
+from cv_densityf._prefilter import (
+    COHERENT,
+    Support,
+    coherence,
+    grouped,
+    place_numbers,
+    ranks,
+    turns,
+)
 from cv_densityf._stopwatch import Stopwatch
 
 Floats = NDArray[np.floating]
@@ -34,28 +42,35 @@ Bools = NDArray[np.bool_]
 NEAR = 0.0
 #: Draws from all matches, whatever the density says, in the order of the caller's scores.
 BY_SCORE = -1.0
-#: Draws from half of the ranked matches, spread over the image: of the most reliable, which are
-#: this share, the first of each cell, then the second of each, and so on. What moves on its own, a
-#: crowd mostly, has few among them.
-SPREAD = -2.0
-_SPREAD_OF = 0.75
+#: Draws from the most reliable three quarters of the ranked matches; where fewer seem right, from
+#: this many times as many, but half at least, for most of the others would be wrong.
+MOST = -2.0
+_MOST = (0.5, 0.75)
+_MOST_OF_RIGHT = 1.15
+#: Draws from two thirds of these, spread over the image: the first of each cell, then the second of
+#: each, and so on. What moves on its own, a crowd mostly, has few among them.
+SPREAD = -3.0
+#: To tell draws from different parts, they pass for so large ones, however few seem right.
+_PASSES_FOR = {MOST: 0.75, SPREAD: 0.5}
 #: Shares of the ranked matches, most reliable first, that hypotheses are drawn from, round by
 #: round.
 ROUNDS = (
     (0.25, SPREAD),
-    (BY_SCORE, 0.75, NEAR),
+    (BY_SCORE, MOST, NEAR),
     (0.125, BY_SCORE, 1.0),
     (0.5, BY_SCORE, NEAR),
     (0.25, NEAR),
     (1.0, NEAR),
 )
+#: Matches of so small a part are close together, and nearly all samples pass for planes.
+_DENSE = 0.25
 #: After so many it may be hopeless.
 _ROUNDS_BY_CHANCE = 2
 _NEAR_WIDTH = 8.0
 #: What the draws agree on may be one of several motions, or a mark that both images bear: with more
-#: than this share of the reliable half unexplained, farther than so many working thresholds, one
-#: more draw is from all that is unexplained, before they may end. A motion that is the larger one
-#: has most of these, so that this draw is short.
+#: than this share of the better half of what seems right unexplained, farther than so many working
+#: thresholds, one more draw is from all that is unexplained, before they may end. A motion that is
+#: the larger one has most of these, so that this draw is short.
 _UNEXPLAINED = 0.1
 _EXPLAINED_WIDTH = 3.0
 _SHORT_DRAW_ITERS = 200
@@ -163,7 +178,7 @@ class Consensus:
 
 def search(
     X: Floats,
-    rankings: Iterable[tuple[NDArray[np.float64], bool]],
+    rankings: Iterable[Support],
     *,
     threshold: float,
     confidence: float,
@@ -171,6 +186,7 @@ def search(
     seed: int,
     watch: Stopwatch,
     about: tuple[Floats, float] | None = None,
+    zoom: float = 1.0,
     scores: Floats | None = None,
     others: Floats | None = None,
     other_scores: Floats | None = None,
@@ -192,12 +208,12 @@ def search(
     ----------
     X : array, shape (n, 4)
         Finite matches.
-    rankings : iterable of (array of shape (n,), bool)
+    rankings : iterable of Support
         Reliability of each match: the weight of its vote, in [0, 1], and its place in the order of
         the draws. NaN where it is not known: such a match is in no draw by density and has half a
-        vote. With it, whether the matches lie together more than by chance. If not, and the
-        inliers of the best hypothesis do not either, the search ends after two rounds. Otherwise
-        it begins anew with the next ranking where no two draws agree.
+        vote. If the matches do not lie together more than by chance, and the inliers of the best
+        hypothesis do not either, the search ends after two rounds. Otherwise it begins anew with
+        the next ranking where no two draws agree.
     threshold : float
         Of the draws, pixels. The mask has one of its own, the caller's.
     confidence, max_iters
@@ -208,6 +224,8 @@ def search(
         Is charged with the time of the draws, and of what is made of them as polish.
     about : (array, float), optional
         What `middle` says of X, if it is known.
+    zoom : float, optional
+        Size of the first image's points in that of the second's.
     scores : array, shape (n,), optional
         The caller's trust in each match: one more draw in three of the rounds takes its samples in
         this order, whatever the density says. And it decides between motions of like size.
@@ -233,13 +251,14 @@ def search(
     n_draws = 0
     pool: _Pool | None = None
     reliability, in_vain = np.empty(0), False
-    for ranking, together in rankings:
+    for support in rankings:
+        ranking = support.reliability
         order = np.argsort(-ranking, kind="stable")[: np.count_nonzero(ranking >= 0.0)]
         reliable = order[: max(MIN_DRAW, len(order) // 2)]
         weights = np.nan_to_num(ranking, nan=0.5)
         latest = _Pool(X, weights, reliable, threshold, rng, frame, scores)
         made, agreed, hopeless = _fill(
-            latest, X, order, together, scores, confidence, max_iters, seed + n_draws, watch
+            latest, X, order, support, zoom, scores, confidence, max_iters, seed + n_draws, watch
         )
         n_draws += made
         if len(latest):
@@ -298,13 +317,15 @@ class _Part(NamedTuple):
     #: Negative where the best hypothesis so far has chosen the matches.
     size: int
     best_first: bool = False
+    zoom: float | None = None
 
 
 def _fill(
     pool: _Pool,
     X: Floats,
     order: Ints,
-    together: bool,
+    support: Support,
+    zoom: float,
     scores: Floats | None,
     confidence: float,
     max_iters: int,
@@ -314,9 +335,10 @@ def _fill(
     """Make rounds of draws until two of them agree, or it is hopeless.
 
     Returns how many draws it took, whether two agree, and whether it is hopeless: the matches do
-    not lie ``together`` more than by chance, and neither do the inliers of the best hypothesis.
+    not lie together more than by chance, and neither do the inliers of the best hypothesis.
     """
     points = X[order].astype(np.float32)
+    most = float(np.clip(_MOST_OF_RIGHT * support.share_right, *_MOST))
     n_draws, agreed, asked_rest = 0, False, False
     for number, fractions in enumerate(ROUNDS, start=1):
         parts = []
@@ -327,22 +349,27 @@ def _fill(
             elif fraction == NEAR and len(pool):
                 part = points[pool.near_best(_NEAR_WIDTH)[order]]
             elif fraction == SPREAD:
-                part = points[pool.spread(order)]
-            elif fraction > 0.0:
-                part = points[: max(MIN_DRAW, int(len(order) * fraction))]
+                part = points[pool.spread(order, most)]
+            elif fraction > 0.0 or fraction == MOST:
+                share = most if fraction == MOST else fraction
+                part = points[: max(MIN_DRAW, int(len(order) * share))]
             else:
                 continue
             share = min(max(len(part) / len(order), 0.25), 1.0)
             iters = min(max_iters, int(MAX_DRAW_ITERS * np.sqrt(0.25 / share)))
             size = -len(part) if fraction == NEAR else len(part)
-            parts.append(_Part(part, iters, size, by_score))
+            if fraction in _PASSES_FOR:
+                size = max(MIN_DRAW, int(len(order) * _PASSES_FOR[fraction]))
+            dense = 0.0 < fraction <= _DENSE
+            parts.append(_Part(part, iters, size, by_score, zoom if dense else None))
         _draw(pool, parts, confidence, seed + n_draws, watch)
         n_draws += len(parts)
         agreed = pool.agrees()
         if agreed and not asked_rest:
             asked_rest = True
             rest = ~pool.near_best(_EXPLAINED_WIDTH)[order]
-            much = rest[: len(order) // 2].mean() > _UNEXPLAINED
+            better = rest[: max(MIN_DRAW // 2, int(support.share_right * len(order)) // 2)]
+            much = better.mean() > _UNEXPLAINED
             if much and np.count_nonzero(rest) >= MIN_DRAW:
                 short = _Part(points[rest], min(max_iters, _SHORT_DRAW_ITERS), 0)
                 _draw(pool, [short], confidence, seed + n_draws, watch)
@@ -350,7 +377,7 @@ def _fill(
                 agreed = pool.agrees()
         if agreed:
             break
-        if not together and number == _ROUNDS_BY_CHANCE and not pool.coherent():
+        if not support.beyond_chance and number == _ROUNDS_BY_CHANCE and not pool.coherent():
             return n_draws, False, True
     return n_draws, agreed, False
 
@@ -366,6 +393,7 @@ def _draw(pool: _Pool, parts: list[_Part], confidence: float, seed: int, watch: 
             part.iters,
             seed + number,
             best_first=part.best_first,
+            zoom=part.zoom,
         )
         if F is not None:
             found.append(F)
@@ -519,11 +547,11 @@ class _Pool:
     def _noise_of(self, squared: Floats) -> float:
         return _noise(squared[self._reliable], self.threshold)
 
-    def spread(self, order: Ints) -> Ints:
-        """Places in an order of reliability of half of its matches, in turn from each cell."""
-        top = order[: max(MIN_DRAW, int(_SPREAD_OF * len(order)))]
+    def spread(self, order: Ints, most: float) -> Ints:
+        """Places in an order of reliability of two thirds of ``most``, in turn from each cell."""
+        top = order[: max(MIN_DRAW, int(most * len(order)))]
         turn = turns(self._ballot.cells[0, top])
-        return np.argsort(turn, kind="stable")[: max(MIN_DRAW, len(order) // 2)]
+        return np.argsort(turn, kind="stable")[: max(MIN_DRAW, int(2 / 3 * most * len(order)))]
 
     def coherent(self) -> bool:
         """Whether the inliers of the best hypothesis stay neighbours, as those of a scene do."""

@@ -45,6 +45,10 @@ _NAMES = {flag: name for name, flag in METHODS.items()}
 #: rest. At a scale at which the threshold is no smaller than this, fewer samples do, and it is for
 #: the caller to look for planes.
 _LEAST_DRAW_THRESHOLD = 3.0
+#: Where nearly all samples do, because they are close together, the second image is made so many
+#: times as large as the first: it asks how far the plane is off in the second one alone, and then
+#: hardly any sample passes.
+_NO_PLANES = 16.0
 
 #: cv2's graph cut takes seconds above a few tens of thousands of matches, and OpenCV 5.0 dies.
 GRAPH_CUT_MAX = 30_000
@@ -175,18 +179,26 @@ def draw(
     max_iters: int,
     seed: int,
     best_first: bool = False,
+    zoom: float | None = None,
 ) -> NDArray[np.float64] | None:
     """Make one quick, seeded draw with cv2's USAC: MSAC score, inner local optimisation.
 
-    Samples are uniform, or PROSAC's if the points come best first.
+    Samples are uniform, or PROSAC's if the points come best first. With ``zoom``, the size of the
+    first image's points in that of the second's, samples are not asked whether they lie on a plane,
+    and the residuals are distances in the first image.
 
     Returns
     -------
     array, shape (3, 3), or None
         None where cv2 raises, or finds no finite matrix other than zero.
     """
-    scale = max(1.0, _LEAST_DRAW_THRESHOLD / threshold)
-    points = points * np.float32(scale)
+    scale, second = max(1.0, _LEAST_DRAW_THRESHOLD / threshold), 1.0
+    if zoom is not None:
+        # What Sampson's distance is in one image, where those in both are as their sizes.
+        threshold *= np.hypot(1.0, zoom)
+        second = _NO_PLANES
+    scales = scale * np.array([1.0, 1.0, second, second])
+    points = points * scales.astype(np.float32)
     params = cv2.UsacParams()
     params.threshold = scale * threshold
     params.confidence = confidence
@@ -204,5 +216,4 @@ def draw(
         return None
     if F is None or not 0.0 < np.abs(F).max() < np.inf:  # nor is NaN
         return None
-    zoom = np.array([scale, scale, 1.0])
-    return np.asarray(F * (zoom[:, None] * zoom), dtype=np.float64)
+    return np.asarray(F * np.outer([*scales[2:], 1.0], [*scales[:2], 1.0]), dtype=np.float64)

@@ -23,7 +23,7 @@ from cv_densityf._arguments import (
 from cv_densityf._consensus import search
 from cv_densityf._engine import Robust, method_flag
 from cv_densityf._epipolar import FAR, mask_and_threshold, middle
-from cv_densityf._prefilter import KEPT, best_scored, contrast_support
+from cv_densityf._prefilter import KEPT, Support, best_scored, contrast_support
 from cv_densityf._stopwatch import Stopwatch
 
 #: One line per estimate at level DEBUG.
@@ -188,9 +188,9 @@ def _estimate(
     if on_a_line:
         return plain("all points of an image are nearly on a line")
     # What is to the eye one image beside another is to residuals one of them alone.
-    units = np.ones(2)
+    units, zoom = np.ones(2), float(sizes[0] / sizes[1])
     if max(sizes) > _OTHER_UNITS * min(sizes):
-        units = max(sizes) / sizes
+        units, zoom = max(sizes) / sizes, 1.0
         Z = Z * units.repeat(2)
         about = middle(Z)
     asked: dict[str, Any] = {
@@ -234,6 +234,7 @@ def _estimate(
                     rankings,
                     watch=watch,
                     about=about,
+                    zoom=zoom,
                     scores=trust,
                     others=others,
                     other_scores=other_scores,
@@ -305,11 +306,8 @@ def _lattice_step(X: NDArray[np.float64], least: float, most: float) -> float:
 
 def _rankings(
     X: NDArray[np.float64], trust: NDArray[np.float64] | None, seed: int, watch: Stopwatch
-) -> Iterator[tuple[NDArray[np.float64], bool]]:
-    """Reliability of a part of the better half by score; then of all.
-
-    With each, whether the matches lie together more than by chance.
-    """
+) -> Iterator[Support]:
+    """Tell the reliability of a part of the better half by score; then of all."""
     n = len(X)
     if n > MAX_RANKED:
         better = np.arange(n) if trust is None else best_scored(trust, max(n // 2, MAX_RANKED))
@@ -320,12 +318,12 @@ def _rankings(
             few = FEW_RANKED
             first = _some(len(rows), few, rng)
             rows = np.concatenate([rows[first], np.delete(rows, first)])
-        reliability, _, together = contrast_support(X, trust, rows, few)
+        support = contrast_support(X, trust, rows, few)
         watch.lap("density")
-        yield reliability, together
-    reliability, _, together = contrast_support(X, trust)
+        yield support
+    support = contrast_support(X, trust)
     watch.lap("density")
-    yield reliability, together
+    yield support
 
 
 def _some(n: int, size: int, rng: np.random.Generator) -> NDArray[np.intp]:

@@ -179,10 +179,31 @@ def coherence(X: Floats) -> float:
     X = np.unique(X, axis=0) if len(X) else X
     if len(X) < 3:
         return np.nan
-    rank, expected = _by_chance(len(X))
-    mean, most = (expected / rank).sum(), (1 / rank).sum()
     some = np.arange(0, len(X), max(1, len(X) // _COHERENCE_OF))
-    return float((density_contrast(X, rows=some).mean() - mean) / (most - mean))
+    return _on_scale(density_contrast(X, rows=some), len(X))
+
+
+def _on_scale(contrast: Floats, n_among: int) -> float:
+    """Mean contrast on a scale from 0 by chance to 1 for the most there can be."""
+    rank, expected = _by_chance(n_among)
+    mean, most = (expected / rank).sum(), (1 / rank).sum()
+    return float((contrast.mean() - mean) / (most - mean))
+
+
+def share_right(contrast: Floats, n_among: int) -> float:
+    """About how many matches are right, from 0 to 1, by the contrast of all or of some of them.
+
+    Of a right match's neighbours as many are right, and only these are shared: its contrast is as
+    their share, and the mean of all matches as its square.
+
+    Parameters
+    ----------
+    contrast : array, shape (m,)
+        `density_contrast` of the matches, or of some that stand for them.
+    n_among : int
+        Number of those that count as neighbours.
+    """
+    return float(np.sqrt(max(_on_scale(contrast, n_among), 0.0)))
 
 
 def _by_chance(n: int) -> tuple[Ints, NDArray[np.float64]]:
@@ -214,11 +235,15 @@ def best_scored(scores: Floats, size: int) -> Ints:
 
 
 class Support(NamedTuple):
-    """Reliability of each match, the denser half, and whether all lie together beyond chance."""
+    """Reliability of each match, the denser half, and what all of them tell together.
+
+    That is whether they lie together beyond chance, and what share of them seems right.
+    """
 
     reliability: NDArray[np.float64]
     kept: Bools
     beyond_chance: bool
+    share_right: float
 
 
 def contrast_support(
@@ -240,10 +265,15 @@ def contrast_support(
     among = None if scores is None else best_scored(scores, n - n // _WORST)
     contrast = density_contrast(X, rows=rows, among=among, few=few)
     rows = rows[: len(contrast)]
-    together = beyond_chance(contrast, n, n if among is None else len(among))
+    n_among = n if among is None else len(among)
     ranked = ranks(contrast)
     if scores is not None:
         ranked = with_scores(ranked, scores[rows])
     reliability = np.full(n, np.nan)
     reliability[rows] = ranked
-    return Support(reliability, reliability >= KEPT, together)
+    return Support(
+        reliability,
+        reliability >= KEPT,
+        beyond_chance(contrast, n, n_among),
+        share_right(contrast, n_among),
+    )

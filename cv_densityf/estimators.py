@@ -338,7 +338,7 @@ class DensityPeaksFilter(BaseEstimator):  # type: ignore[misc]
         weight = _validated_weight(sample_weight, matches)
         reliability: NDArray[np.floating]
         if n >= MIN_FILTERED and self.rule == "contrast":
-            reliability, support, _ = contrast_support(checked_points(matches), weight)
+            reliability, support, *_ = contrast_support(checked_points(matches), weight)
         else:
             reliability, support = np.ones(n), np.ones(n, dtype=bool)
             if n >= MIN_FILTERED:

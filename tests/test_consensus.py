@@ -24,7 +24,7 @@ from cv_densityf._epipolar import (
     sampson_distance,
     shift,
 )
-from cv_densityf._prefilter import contrast_support
+from cv_densityf._prefilter import Support, contrast_support
 from cv_densityf._stopwatch import Stopwatch
 from cv_densityf.datasets import two_view_scene
 
@@ -32,10 +32,15 @@ SEEDS = range(4)
 ASKED = {"threshold": 1.0, "confidence": 0.999, "max_iters": 5000}
 
 
-def find(X, reliability=None, *, together=True, seed=0, **asked):
+def told(reliability, *, together=True, right=1.0):
+    return Support(reliability, reliability >= 0.5, together, right)
+
+
+def find(X, reliability=None, *, together=True, right=1.0, seed=0, **asked):
     if reliability is None:
         reliability = contrast_support(X)[0]
-    return search(X, [(reliability, together)], seed=seed, watch=Stopwatch(), **{**ASKED, **asked})
+    support = told(reliability, together=together, right=right)
+    return search(X, [support], seed=seed, watch=Stopwatch(), **{**ASKED, **asked})
 
 
 def true_matches(seed, n=400):
@@ -433,6 +438,15 @@ def test_what_is_unreliable_may_stay_unexplained(monkeypatch):
     draws = spied_draws(monkeypatch, _engine.draw)
     find(X, np.linspace(1.0, 0.0, 670))
     assert len(draws) == 2
+    # If so few seem right, the others are unreliable.
+    draws.clear()
+    reliability = np.linspace(1.0, 0.0, 670)
+    reliability[400:] += 0.3
+    find(X, reliability, right=0.6)
+    assert len(draws) == 2
+    draws.clear()
+    find(X, reliability, right=1.0)
+    assert len(draws) == 3
 
 
 def test_what_is_not_ranked_has_half_a_vote(monkeypatch):
@@ -464,7 +478,7 @@ def test_two_different_answers_are_no_agreement(monkeypatch):
 
 def test_where_all_lies_together_only_as_by_chance_the_search_ends_early(monkeypatch):
     wrong = scene_of(0).X
-    wrong[:, 2:] = np.random.default_rng(0).permutation(wrong[:, 2:])
+    wrong[:, 2:] = np.random.default_rng(2).permutation(wrong[:, 2:])
     draws = spied_draws(monkeypatch, _engine.draw)
     optimised = []
     monkeypatch.setattr(_Pool, "optimise", lambda pool: optimised.append(pool))
@@ -484,7 +498,7 @@ def test_where_all_lies_together_only_as_by_chance_the_search_ends_early(monkeyp
 def test_another_ranking_is_not_asked_for_where_it_is_hopeless():
     wrong = scene_of(0).X
     wrong[:, 2:] = np.random.default_rng(0).permutation(wrong[:, 2:])
-    rankings = iter([(contrast_support(wrong)[0], False), None])
+    rankings = iter([told(contrast_support(wrong)[0], together=False), None])
     search(wrong, rankings, seed=0, watch=Stopwatch(), **ASKED)
     assert next(rankings) is None
 
@@ -594,7 +608,7 @@ def test_no_draw_no_answer(monkeypatch):
 def test_draws_get_the_callers_bounds(monkeypatch):
     asked = []
 
-    def recorded(points, threshold, confidence, max_iters, seed, best_first):
+    def recorded(points, threshold, confidence, max_iters, seed, **_):
         asked.append((threshold, confidence, max_iters, seed, len(points)))
 
     monkeypatch.setattr(_consensus, "draw", recorded)
@@ -627,30 +641,44 @@ def spied_draws(monkeypatch, answer=lambda *_, **__: None):
     """Record the arguments of each draw, which is then answered by ``answer``."""
     seen = []
 
-    def draw(points, threshold, confidence, max_iters, seed, best_first=False):
+    def draw(points, threshold, confidence, max_iters, seed, best_first=False, zoom=None):
         seen.append((points, threshold, max_iters, best_first))
-        return answer(points, threshold, confidence, max_iters, seed, best_first)
+        return answer(points, threshold, confidence, max_iters, seed, best_first, zoom)
 
     monkeypatch.setattr(_consensus, "draw", draw)
     return seen
 
 
-def test_the_second_draw_takes_the_cells_of_the_first_image_in_turn(monkeypatch):
-    """The most reliable of each, then the second of each, up to half; the last quarter is out."""
+@pytest.mark.parametrize(
+    ("right", "top", "size"), [(1.0, 450, 300), (0.5, 346, 231), (0.1, 300, 200)]
+)
+def test_the_second_draw_takes_the_cells_of_the_first_image_in_turn(right, top, size, monkeypatch):
+    """The most reliable of each, then the second of each; what is mostly wrong is out."""
     seen = spied_draws(monkeypatch)
     rng = np.random.default_rng(0)
     X = rng.uniform(0, 800, (600, 4))
     X[:300, :2] = 200 + X[:300, :2] / 50  # a crowd
     X[-2:, :2] = (0, 0), (800, 800)
     reliability = rng.permutation(600) / 600
-    find(X, reliability)
-    order = np.argsort(-reliability)[:450]
+    find(X, reliability, right=right)
+    order = np.argsort(-reliability)[:top]
     cells = [tuple(cell) for cell in np.minimum(X[order, :2] // 50, 15)]
     turns = [cells[:i].count(cell) for i, cell in enumerate(cells)]
-    expected = X[order[sorted(range(450), key=lambda i: turns[i])[:300]]]
+    expected = X[order[sorted(range(top), key=lambda i: turns[i])[:size]]]
     points = seen[1][0]
     np.testing.assert_allclose(points - points[0], expected - expected[0], atol=1e-3)
     assert np.mean(np.ptp(expected[:100, :2], axis=0)) > 700
+
+
+def test_only_dense_parts_take_no_planes(monkeypatch):
+    zooms = {}
+
+    def draw(points, *_, best_first, zoom):
+        zooms.setdefault(len(points), zoom)
+
+    monkeypatch.setattr(_consensus, "draw", draw)
+    find(scene_of(0).X, zoom=2.0)
+    assert zooms == {150: 2.0, 75: 2.0, 300: None, 450: None, 600: None}
 
 
 def test_scores_give_three_more_draws_in_their_order(monkeypatch):
@@ -788,7 +816,7 @@ def test_the_unit_of_length_hardly_matters_to_the_search(factor):
 def test_the_unit_of_length_does_not_matter_to_what_is_made_of_the_draws(factor, seed, monkeypatch):
     """A power of two leaves every rounding as it is, but those of some of BLAS's kernels."""
 
-    def fit(points, threshold, confidence, max_iters, seed, best_first):
+    def fit(points, threshold, confidence, max_iters, seed, **_):
         rows = np.random.default_rng(seed).permutation(min(len(points), 60))[:12]
         return eight_point(points[None, rows].astype(np.float64))[0]
 
@@ -961,37 +989,37 @@ def test_agreement_is_of_inliers_from_parts_of_other_sizes(common, more, sizes, 
 
 def test_the_next_ranking_is_asked_for_where_no_two_draws_agree(monkeypatch):
     scene = scene_of(0, inlier_ratio=0.6, noise=0.2)
-    told = 0.5 + 0.5 * scene.inliers
+    led = 0.5 + 0.5 * scene.inliers
     misled = np.where(scene.inliers, np.nan, 1.0)
     asked = []
 
     def rankings(*tried):
         for reliability in tried:
             asked.append(reliability)
-            yield reliability, True
+            yield told(reliability)
 
     options = {"seed": 0, "watch": Stopwatch(), **ASKED}
-    easy = search(scene.X, rankings(told, misled), **options)
+    easy = search(scene.X, rankings(led, misled), **options)
     assert len(asked) == 1
     seeds = []
 
-    def draw(points, threshold, confidence, max_iters, seed, best_first=False):
+    def draw(points, threshold, confidence, max_iters, seed, **how):
         seeds.append(seed)
-        return _engine.draw(points, threshold, confidence, max_iters, seed, best_first)
+        return _engine.draw(points, threshold, confidence, max_iters, seed, **how)
 
     monkeypatch.setattr(_consensus, "draw", draw)
     agrees = _Pool.agrees
     monkeypatch.setattr(
         _Pool, "agrees", lambda pool, *how, **more: len(asked) > 2 and agrees(pool, *how, **more)
     )
-    found = search(scene.X, rankings(misled, told), **options)
+    found = search(scene.X, rankings(misled, led), **options)
     assert len(seeds) == len(set(seeds)) == found.n_draws
     assert len(asked) == 3
     assert found.n_draws > 10
-    np.testing.assert_array_equal(found.reliability, told)
-    np.testing.assert_array_equal(easy.reliability, told)
+    np.testing.assert_array_equal(found.reliability, led)
+    np.testing.assert_array_equal(easy.reliability, led)
     assert sampson_distance(found.F, true_matches(0)).mean() < 0.2
-    alone = search(scene.X, [(misled, True)], **options)
+    alone = search(scene.X, [told(misled)], **options)
     assert sampson_distance(alone.F, true_matches(0)).mean() > 1.0
 
 
@@ -1000,15 +1028,15 @@ def test_a_ranking_without_any_draw_leaves_what_the_one_before_found(monkeypatch
     first, second = contrast_support(X)[0], np.linspace(0.0, 1.0, len(X))
     monkeypatch.setattr(_Pool, "agrees", lambda *_, **__: False)
     options = {"watch": Stopwatch(), **ASKED}
-    alone = search(X, [(first, True)], seed=0, **options)
+    alone = search(X, [told(first)], seed=0, **options)
 
-    def draw(points, threshold, confidence, max_iters, seed, best_first=False):
+    def draw(points, threshold, confidence, max_iters, seed, **how):
         if seed < alone.n_draws:
-            return _engine.draw(points, threshold, confidence, max_iters, seed, best_first)
+            return _engine.draw(points, threshold, confidence, max_iters, seed, **how)
         return None
 
     monkeypatch.setattr(_consensus, "draw", draw)
-    found = search(X, [(first, True), (second, True)], seed=0, **options)
+    found = search(X, [told(first), told(second)], seed=0, **options)
     assert found.n_draws > alone.n_draws
     np.testing.assert_array_equal(found.F, alone.F)
     assert found.reliability is first
@@ -1131,7 +1159,7 @@ def test_the_watch_tells_draws_from_the_rest(monkeypatch):
     monkeypatch.setattr(_Pool, "agrees", lambda *_, **__: False)
     watch = Stopwatch()
     X = scene_of(0).X
-    found = search(X, [(contrast_support(X)[0], True)], seed=0, watch=watch, **ASKED)
+    found = search(X, [contrast_support(X)], seed=0, watch=watch, **ASKED)
     draws = 1000 * found.n_draws
     assert watch.laps == {"draws": draws, "polish": 1000 * now - draws}
 

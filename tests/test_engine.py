@@ -224,6 +224,15 @@ def test_small_thresholds_do_not_depend_on_the_unit_of_length(seed):
     np.testing.assert_array_equal(eighth, F * np.outer([8, 8, 1], [8, 8, 1]))
 
 
+@pytest.mark.parametrize("zoom", [0.1, 1.0, 10.0])
+def test_a_draw_that_takes_no_planes_bears_images_of_any_size(scene, zoom):
+    """Its residuals are those of the first image, which may be the larger one."""
+    X = np.hstack([scene.points1, scene.points2 / zoom])
+    smaller = min(1.0, 1.0 / zoom)
+    F = draw(X.astype(np.float32), smaller, 0.999, 1000, 0, zoom=zoom)
+    assert np.mean(sampson_distance(F, X[scene.inliers]) < 2.0 * smaller) > 0.9
+
+
 def test_draws_depend_on_the_seed_alone():
     hard = two_view_scene(300, inlier_ratio=0.3, noise=1.0, random_state=0).X.astype(np.float32)
     draws = [draw(hard, 1.0, 0.99, 50, seed) for seed in (0, 1, 2, 0)]

@@ -501,7 +501,7 @@ def test_a_step_of_imbalanced_learns_pipeline(scene, with_y):
 
 def test_rules_are_those_of_the_prefilter_module(scene):
     contrast = DensityPeaksFilter().fit(scene.X)
-    reliability, kept, _ = contrast_support(scene.X)
+    reliability, kept, *_ = contrast_support(scene.X)
     np.testing.assert_array_equal(contrast.reliability_, reliability)
     np.testing.assert_array_equal(contrast.support_, kept)
     paper = DensityPeaksFilter("paper", alpha=0.02, dc_percent=5).fit(scene.X)

@@ -121,7 +121,7 @@ def test_where_most_are_right_few_tell(inlier_ratio, looked_at):
     expected = density_contrast(X)[rows]
     assert (expected[:100].mean() > CLEAN) == (looked_at == 100)
     np.testing.assert_array_equal(density_contrast(X, rows, few=100), expected[:looked_at])
-    reliability, kept, _ = contrast_support(X, rows=rows, few=100)
+    reliability, kept, *_ = contrast_support(X, rows=rows, few=100)
     seen = rows[:looked_at]
     np.testing.assert_array_equal(reliability[seen], ranks(expected[:looked_at]))
     assert np.isnan(np.delete(reliability, seen)).all()
@@ -221,7 +221,7 @@ def test_contrast_of_some_rows_is_theirs_among_all(n):
 def test_rows_that_are_not_looked_at_are_neither_reliable_nor_kept():
     X = scene_of(5).X
     rows = np.arange(0, 400, 3)
-    reliability, kept, _ = contrast_support(X, rows=rows)
+    reliability, kept, *_ = contrast_support(X, rows=rows)
     np.testing.assert_array_equal(reliability[rows], ranks(density_contrast(X)[rows]))
     others = np.delete(np.arange(400), rows)
     assert np.isnan(reliability[others]).all()
@@ -305,7 +305,7 @@ def test_contrast_does_not_care_which_image_comes_first_nor_for_the_order(seed):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_right_matches_rank_above_wrong_ones(seed):
     scene = scene_of(seed, 600, inlier_ratio=0.3)
-    reliability, kept, _ = contrast_support(scene.X)
+    reliability, kept, *_ = contrast_support(scene.X)
     assert auc(reliability, scene.inliers) > 0.8
     top = np.argsort(-reliability)[:90]
     assert scene.inliers[top].mean() > 0.8
@@ -330,7 +330,7 @@ def test_ranks_run_from_zero_to_one_and_ties_share_one():
 
 def test_reliability_is_the_rank_of_the_contrast_and_the_better_half_is_kept():
     X = scene_of(3, 101).X
-    reliability, kept, _ = contrast_support(X)
+    reliability, kept, *_ = contrast_support(X)
     np.testing.assert_array_equal(reliability, ranks(density_contrast(X)))
     assert kept.dtype == bool
     assert kept.sum() == 51
@@ -383,3 +383,15 @@ def test_good_scores_help_and_bad_ones_do_not_overrule_the_contrast(seed):
     assert auc(contrast_support(scene.X, good)[0], scene.inliers) > alone
     assert auc(contrast_support(scene.X, rng.uniform(size=600))[0], scene.inliers) > 0.75
     assert auc(contrast_support(scene.X, -good)[0], scene.inliers) > 0.5
+
+
+@pytest.mark.parametrize("n", [60, 400, 3000])
+@pytest.mark.parametrize("ratio", [0.0, 0.1, 0.3, 0.5, 0.7, 0.9])
+def test_the_contrast_tells_how_many_are_right(n, ratio):
+    shares = [
+        contrast_support(
+            two_view_scene(n, inlier_ratio=ratio, noise=0.5, random_state=seed).X
+        ).share_right
+        for seed in range(3)
+    ]
+    assert abs(np.median(shares) - ratio) < 0.15
