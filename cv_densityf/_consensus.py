@@ -551,7 +551,7 @@ class _Pool:
         """Places in an order of reliability of two thirds of ``most``, in turn from each cell."""
         top = order[: max(MIN_DRAW, int(most * len(order)))]
         turn = turns(self._ballot.cells[0, top])
-        return np.argsort(turn, kind="stable")[: max(MIN_DRAW, int(2 / 3 * most * len(order)))]
+        return np.argsort(turn, kind="stable")[: max(MIN_DRAW, 2 * len(top) // 3)]
 
     def coherent(self) -> bool:
         """Whether the inliers of the best hypothesis stay neighbours, as those of a scene do."""
