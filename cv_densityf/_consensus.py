@@ -42,26 +42,24 @@ Bools = NDArray[np.bool_]
 NEAR = 0.0
 #: Draws from all matches, whatever the density says, in the order of the caller's scores.
 BY_SCORE = -1.0
-#: Draws from the most reliable three quarters of the ranked matches; where fewer seem right, from
-#: this many times as many, but half at least, for most of the others would be wrong.
-MOST = -2.0
-_MOST = (0.5, 0.75)
-_MOST_OF_RIGHT = 1.15
-#: Draws from two thirds of these, spread over the image: the first of each cell, then the second of
-#: each, and so on. What moves on its own, a crowd mostly, has few among them.
-SPREAD = -3.0
-#: To tell draws from different parts, they pass for so large ones, however few seem right.
-_PASSES_FOR = {MOST: 0.75, SPREAD: 0.5}
+#: Draws from half of the ranked matches, spread over the image: of the most reliable three quarters
+#: the first of each cell, then the second of each, and so on. What moves on its own, a crowd
+#: mostly, has few among them.
+SPREAD = -2.0
+_SPREAD_OF = 0.75
 #: Shares of the ranked matches, most reliable first, that hypotheses are drawn from, round by
-#: round.
+#: round. Where fewer than this share of them seem right, all parts but the whole shrink as these
+#: do, to so much at most: most of what is left out is wrong.
 ROUNDS = (
     (0.25, SPREAD),
-    (BY_SCORE, MOST, NEAR),
+    (BY_SCORE, 0.75, NEAR),
     (0.125, BY_SCORE, 1.0),
     (0.5, BY_SCORE, NEAR),
     (0.25, NEAR),
     (1.0, NEAR),
 )
+_MOSTLY_RIGHT = 2 / 3
+_SMALLEST = 2 / 3
 #: Matches of so small a part are close together, and nearly all samples pass for planes.
 _DENSE = 0.25
 #: After so many it may be hopeless.
@@ -186,7 +184,6 @@ def search(
     seed: int,
     watch: Stopwatch,
     about: tuple[Floats, float] | None = None,
-    zoom: float = 1.0,
     scores: Floats | None = None,
     others: Floats | None = None,
     other_scores: Floats | None = None,
@@ -224,8 +221,6 @@ def search(
         Is charged with the time of the draws, and of what is made of them as polish.
     about : (array, float), optional
         What `middle` says of X, if it is known.
-    zoom : float, optional
-        Size of the first image's points in that of the second's.
     scores : array, shape (n,), optional
         The caller's trust in each match: one more draw in three of the rounds takes its samples in
         this order, whatever the density says. And it decides between motions of like size.
@@ -258,7 +253,7 @@ def search(
         weights = np.nan_to_num(ranking, nan=0.5)
         latest = _Pool(X, weights, reliable, threshold, rng, frame, scores)
         made, agreed, hopeless = _fill(
-            latest, X, order, support, zoom, scores, confidence, max_iters, seed + n_draws, watch
+            latest, X, order, support, scores, confidence, max_iters, seed + n_draws, watch
         )
         n_draws += made
         if len(latest):
@@ -317,7 +312,8 @@ class _Part(NamedTuple):
     #: Negative where the best hypothesis so far has chosen the matches.
     size: int
     best_first: bool = False
-    zoom: float | None = None
+    #: Whether samples are asked whether they lie on a plane.
+    planes: bool = True
 
 
 def _fill(
@@ -325,7 +321,6 @@ def _fill(
     X: Floats,
     order: Ints,
     support: Support,
-    zoom: float,
     scores: Floats | None,
     confidence: float,
     max_iters: int,
@@ -338,7 +333,7 @@ def _fill(
     not lie together more than by chance, and neither do the inliers of the best hypothesis.
     """
     points = X[order].astype(np.float32)
-    most = float(np.clip(_MOST_OF_RIGHT * support.share_right, *_MOST))
+    shrunk = float(np.clip(support.share_right / _MOSTLY_RIGHT, _SMALLEST, 1.0))
     n_draws, agreed, asked_rest = 0, False, False
     for number, fractions in enumerate(ROUNDS, start=1):
         parts = []
@@ -349,19 +344,17 @@ def _fill(
             elif fraction == NEAR and len(pool):
                 part = points[pool.near_best(_NEAR_WIDTH)[order]]
             elif fraction == SPREAD:
-                part = points[pool.spread(order, most)]
-            elif fraction > 0.0 or fraction == MOST:
-                share = most if fraction == MOST else fraction
-                part = points[: max(MIN_DRAW, int(len(order) * share))]
+                part = points[pool.spread(order, shrunk)]
+            elif fraction > 0.0:
+                wanted = fraction * shrunk if fraction < 1.0 else 1.0
+                part = points[: max(MIN_DRAW, int(wanted * len(order)))]
             else:
                 continue
             share = min(max(len(part) / len(order), 0.25), 1.0)
             iters = min(max_iters, int(MAX_DRAW_ITERS * np.sqrt(0.25 / share)))
             size = -len(part) if fraction == NEAR else len(part)
-            if fraction in _PASSES_FOR:
-                size = max(MIN_DRAW, int(len(order) * _PASSES_FOR[fraction]))
-            dense = 0.0 < fraction <= _DENSE
-            parts.append(_Part(part, iters, size, by_score, zoom if dense else None))
+            planes = fraction <= 0.0 or len(part) > _DENSE * len(order)
+            parts.append(_Part(part, iters, size, by_score, planes))
         _draw(pool, parts, confidence, seed + n_draws, watch)
         n_draws += len(parts)
         agreed = pool.agrees()
@@ -393,7 +386,7 @@ def _draw(pool: _Pool, parts: list[_Part], confidence: float, seed: int, watch: 
             part.iters,
             seed + number,
             best_first=part.best_first,
-            zoom=part.zoom,
+            planes=part.planes,
         )
         if F is not None:
             found.append(F)
@@ -547,9 +540,12 @@ class _Pool:
     def _noise_of(self, squared: Floats) -> float:
         return _noise(squared[self._reliable], self.threshold)
 
-    def spread(self, order: Ints, most: float) -> Ints:
-        """Places in an order of reliability of two thirds of ``most``, in turn from each cell."""
-        top = order[: max(MIN_DRAW, int(most * len(order)))]
+    def spread(self, order: Ints, shrunk: float) -> Ints:
+        """Places in an order of reliability of half of its matches, in turn from each cell.
+
+        Or of so much less than half.
+        """
+        top = order[: max(MIN_DRAW, int(_SPREAD_OF * shrunk * len(order)))]
         turn = turns(self._ballot.cells[0, top])
         return np.argsort(turn, kind="stable")[: max(MIN_DRAW, 2 * len(top) // 3)]
 

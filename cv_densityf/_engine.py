@@ -179,13 +179,12 @@ def draw(
     max_iters: int,
     seed: int,
     best_first: bool = False,
-    zoom: float | None = None,
+    planes: bool = True,
 ) -> NDArray[np.float64] | None:
     """Make one quick, seeded draw with cv2's USAC: MSAC score, inner local optimisation.
 
-    Samples are uniform, or PROSAC's if the points come best first. With ``zoom``, the size of the
-    first image's points in that of the second's, samples are not asked whether they lie on a plane,
-    and the residuals are distances in the first image.
+    Samples are uniform, or PROSAC's if the points come best first. Without ``planes`` they are not
+    asked whether they lie on one, and the residuals are distances in the first image.
 
     Returns
     -------
@@ -193,10 +192,11 @@ def draw(
         None where cv2 raises, or finds no finite matrix other than zero.
     """
     scale, second = max(1.0, _LEAST_DRAW_THRESHOLD / threshold), 1.0
-    if zoom is not None:
-        # What Sampson's distance is in one image, where those in both are as their sizes.
+    if not planes:
+        zoom = _zoom(points)
+        # What Sampson's distance is in the first image, where those in both are as their sizes.
         threshold *= np.hypot(1.0, zoom)
-        second = _NO_PLANES
+        second = _NO_PLANES * zoom
     scales = scale * np.array([1.0, 1.0, second, second])
     points = points * scales.astype(np.float32)
     params = cv2.UsacParams()
@@ -217,3 +217,11 @@ def draw(
     if F is None or not 0.0 < np.abs(F).max() < np.inf:  # nor is NaN
         return None
     return np.asarray(F * np.outer([*scales[2:], 1.0], [*scales[:2], 1.0]), dtype=np.float64)
+
+
+def _zoom(points: NDArray[np.float32]) -> float:
+    """Size of most of the first image's points (n, 4) in that of the second's."""
+    n = len(points)
+    quarters = np.partition(points.T, (n // 4, 3 * n // 4), axis=1)
+    first, second = np.hypot(*(quarters[:, 3 * n // 4] - quarters[:, n // 4]).reshape(2, 2).T)
+    return float(first / second) if first > 0.0 and second > 0.0 else 1.0

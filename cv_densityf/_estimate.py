@@ -188,9 +188,9 @@ def _estimate(
     if on_a_line:
         return plain("all points of an image are nearly on a line")
     # What is to the eye one image beside another is to residuals one of them alone.
-    units, zoom = np.ones(2), float(sizes[0] / sizes[1])
+    units = np.ones(2)
     if max(sizes) > _OTHER_UNITS * min(sizes):
-        units, zoom = max(sizes) / sizes, 1.0
+        units = max(sizes) / sizes
         Z = Z * units.repeat(2)
         about = middle(Z)
     asked: dict[str, Any] = {
@@ -234,7 +234,6 @@ def _estimate(
                     rankings,
                     watch=watch,
                     about=about,
-                    zoom=zoom,
                     scores=trust,
                     others=others,
                     other_scores=other_scores,

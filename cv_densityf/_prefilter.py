@@ -194,14 +194,15 @@ def share_right(contrast: Floats, n_among: int) -> float:
     """About how many matches are right, from 0 to 1, by the contrast of all or of some of them.
 
     Of a right match's neighbours as many are right, and only these are shared: its contrast is as
-    their share, and the mean of all matches as its square.
+    their share, and the mean of all matches as its square. Where those that count as neighbours are
+    better ones, it is between their share and that of the others; copies make it less.
 
     Parameters
     ----------
     contrast : array, shape (m,)
         `density_contrast` of the matches, or of some that stand for them.
     n_among : int
-        Number of those that count as neighbours.
+        Number of those that count as neighbours, 3 at least.
     """
     return float(np.sqrt(max(_on_scale(contrast, n_among), 0.0)))
 

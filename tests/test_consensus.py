@@ -447,6 +447,10 @@ def test_what_is_unreliable_may_stay_unexplained(monkeypatch):
     draws.clear()
     find(X, reliability, right=1.0)
     assert len(draws) == 3
+    # Of the few that are ranked, not of all, and some at least.
+    draws.clear()
+    find(X, np.where(np.arange(670) % 2, reliability, np.nan), right=0.6)
+    assert len(draws) == 2
 
 
 def test_what_is_not_ranked_has_half_a_vote(monkeypatch):
@@ -641,16 +645,16 @@ def spied_draws(monkeypatch, answer=lambda *_, **__: None):
     """Record the arguments of each draw, which is then answered by ``answer``."""
     seen = []
 
-    def draw(points, threshold, confidence, max_iters, seed, best_first=False, zoom=None):
+    def draw(points, threshold, confidence, max_iters, seed, best_first=False, planes=True):
         seen.append((points, threshold, max_iters, best_first))
-        return answer(points, threshold, confidence, max_iters, seed, best_first, zoom)
+        return answer(points, threshold, confidence, max_iters, seed, best_first, planes)
 
     monkeypatch.setattr(_consensus, "draw", draw)
     return seen
 
 
 @pytest.mark.parametrize(
-    ("right", "top", "size"), [(1.0, 450, 300), (0.5, 345, 230), (0.1, 300, 200)]
+    ("right", "top", "size"), [(1.0, 450, 300), (0.5, 337, 224), (0.1, 300, 200)]
 )
 def test_the_second_draw_takes_the_cells_of_the_first_image_in_turn(right, top, size, monkeypatch):
     """The most reliable of each, then the second of each; what is mostly wrong is out."""
@@ -670,15 +674,31 @@ def test_the_second_draw_takes_the_cells_of_the_first_image_in_turn(right, top, 
     assert np.mean(np.ptp(expected[:100, :2], axis=0)) > 700
 
 
-def test_only_dense_parts_take_no_planes(monkeypatch):
-    zooms = {}
+@pytest.mark.parametrize(
+    ("right", "sizes"),
+    [
+        (1.0, [150, 300, 450, 75, 600, 300, 150, 600]),
+        (0.1, [100, 200, 300, 50, 600, 200, 100, 600]),
+    ],
+)
+def test_where_few_seem_right_all_parts_but_the_whole_are_smaller(right, sizes, monkeypatch):
+    seen = spied_draws(monkeypatch)
+    find(scene_of(0).X, right=right)
+    assert [len(points) for points, *_ in seen] == sizes
 
-    def draw(points, *_, best_first, zoom):
-        zooms.setdefault(len(points), zoom)
+
+def test_only_dense_parts_are_not_asked_for_planes(monkeypatch):
+    asked = {}
+
+    def draw(points, *_, best_first, planes):
+        asked[len(points)] = planes
 
     monkeypatch.setattr(_consensus, "draw", draw)
-    find(scene_of(0).X, zoom=2.0)
-    assert zooms == {150: 2.0, 75: 2.0, 300: None, 450: None, 600: None}
+    find(scene_of(0).X)
+    assert asked == {150: False, 75: False, 300: True, 450: True, 600: True}
+    asked.clear()
+    find(scene_of(0, 50).X)
+    assert all(asked.values()), "thirty of fifty are no dense part"
 
 
 def test_scores_give_three_more_draws_in_their_order(monkeypatch):

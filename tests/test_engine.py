@@ -224,13 +224,33 @@ def test_small_thresholds_do_not_depend_on_the_unit_of_length(seed):
     np.testing.assert_array_equal(eighth, F * np.outer([8, 8, 1], [8, 8, 1]))
 
 
-@pytest.mark.parametrize("zoom", [0.1, 1.0, 10.0])
-def test_a_draw_that_takes_no_planes_bears_images_of_any_size(scene, zoom):
-    """Its residuals are those of the first image, which may be the larger one."""
-    X = np.hstack([scene.points1, scene.points2 / zoom])
-    smaller = min(1.0, 1.0 / zoom)
-    F = draw(X.astype(np.float32), smaller, 0.999, 1000, 0, zoom=zoom)
-    assert np.mean(sampson_distance(F, X[scene.inliers]) < 2.0 * smaller) > 0.9
+@pytest.mark.parametrize("zoom", [0.04, 1.0, 25.0])
+def test_without_planes_the_second_image_is_the_larger_one_to_cv2(scene, zoom, monkeypatch):
+    """And residuals compare with the threshold as they do without, whatever the images' sizes."""
+    X = np.hstack([scene.points1 * zoom, scene.points2])
+    X[0, :2] = 1e6
+    told = []
+
+    def spy(points1, points2, params):
+        told.append((np.hstack([points1, points2]), params.threshold))
+        return original(points1, points2, params)
+
+    monkeypatch.setattr(_engine, "original", spy)
+    F = draw(X.astype(np.float32), min(1.0, zoom), 0.999, 1000, 0, planes=False)
+    ((points, threshold),) = told
+    sizes = np.median(np.abs(points - np.median(points, axis=0)), axis=0).reshape(2, 2)
+    assert np.hypot(*sizes[1]) / np.hypot(*sizes[0]) == pytest.approx(16.0, rel=0.2)
+    factor = (points[2:] / X[2:]).mean(axis=0)
+    to_cv2 = np.diag([1.0 / factor[2], 1.0 / factor[3], 1.0]) @ F
+    of_cv2 = sampson_distance(to_cv2 @ np.diag([1.0 / factor[0], 1.0 / factor[1], 1.0]), points)
+    ratio = of_cv2 / threshold / (sampson_distance(F, X) / min(1.0, zoom))
+    assert np.median(ratio) == pytest.approx(1.0, rel=0.25)
+    right = X[scene.inliers][1:]
+    assert np.mean(sampson_distance(F, right) < 2.0 * min(1.0, zoom)) > 0.9
+
+
+def test_without_planes_copies_of_one_match_are_no_error():
+    assert draw(np.ones((40, 4), np.float32), 1.0, 0.99, 100, 0, planes=False) is None
 
 
 def test_draws_depend_on_the_seed_alone():

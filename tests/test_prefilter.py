@@ -395,3 +395,10 @@ def test_the_contrast_tells_how_many_are_right(n, ratio):
         for seed in range(3)
     ]
     assert abs(np.median(shares) - ratio) < 0.15
+
+
+def test_with_scores_neighbours_are_the_better_ones():
+    """By chance two of these share more; it is to be taken off all the same."""
+    X = np.random.default_rng(0).uniform(0, 1000, (100, 4))
+    scores = np.arange(100.0)
+    assert contrast_support(X, scores).share_right < 0.15
