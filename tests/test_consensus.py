@@ -453,6 +453,17 @@ def test_what_is_unreliable_may_stay_unexplained(monkeypatch):
     assert len(draws) == 2
 
 
+def test_some_are_asked_what_is_unexplained_however_few_seem_right(monkeypatch):
+    right = true_matches(0, 400)
+    X = np.vstack([right, np.random.default_rng(0).uniform(0, [1280, 960] * 2, (100, 4))])
+    reliability = np.linspace(0.8, 0.0, 500)
+    reliability[400:410] = 0.9
+    reliability[0] = 1.0
+    draws = spied_draws(monkeypatch, _engine.draw)
+    find(X, reliability, right=0.0)
+    assert len(draws) == 3
+
+
 def test_what_is_not_ranked_has_half_a_vote(monkeypatch):
     told = []
 

@@ -397,8 +397,12 @@ def test_the_contrast_tells_how_many_are_right(n, ratio):
     assert abs(np.median(shares) - ratio) < 0.15
 
 
-def test_with_scores_neighbours_are_the_better_ones():
-    """By chance two of these share more; it is to be taken off all the same."""
-    X = np.random.default_rng(0).uniform(0, 1000, (100, 4))
-    scores = np.arange(100.0)
-    assert contrast_support(X, scores).share_right < 0.15
+def test_of_fewer_neighbours_more_are_shared_by_chance():
+    """With scores these are the better ones, and it is to be taken off all the same."""
+    shares = [
+        contrast_support(
+            np.random.default_rng(seed).uniform(0, 1000, (30, 4)), np.arange(30.0)
+        ).share_right
+        for seed in range(20)
+    ]
+    assert np.median(shares) < 0.1
