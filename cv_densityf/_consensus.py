@@ -333,7 +333,9 @@ def _fill(
     not lie together more than by chance, and neither do the inliers of the best hypothesis.
     """
     points = X[order].astype(np.float32)
-    shrunk = float(np.clip(support.share_right / _MOSTLY_RIGHT, _SMALLEST, 1.0))
+    # A half of fewer could not be told from a quarter, which is `MIN_DRAW` at least.
+    smallest = max(_SMALLEST, 3 * MIN_DRAW / len(order))
+    shrunk = float(np.clip(support.share_right / _MOSTLY_RIGHT, smallest, 1.0))
     n_draws, agreed, asked_rest = 0, False, False
     for number, fractions in enumerate(ROUNDS, start=1):
         parts = []

@@ -696,6 +696,12 @@ def test_where_few_seem_right_all_parts_but_the_whole_are_smaller(right, sizes, 
     seen = spied_draws(monkeypatch)
     find(scene_of(0).X, right=right)
     assert [len(points) for points, *_ in seen] == sizes
+    # Not so small that their draws would not be independent.
+    seen.clear()
+    find(scene_of(0, 100).X, right=right)
+    quarter, half = (len(points) for points, *_ in seen[:2])
+    assert quarter == _consensus.MIN_DRAW
+    assert half >= _consensus._DISTINCT * quarter
 
 
 def test_only_dense_parts_are_not_asked_for_planes(monkeypatch):
