@@ -316,7 +316,8 @@ def test_rivals_of_other_inliers_are_optimised(monkeypatch):
 
     monkeypatch.setattr(_Pool, "_optimised", spy)
     pool.optimise()
-    np.testing.assert_array_equal(starts, pool._G[[0, 2]])
+    # Of two copies rounding tells which is the better one.
+    np.testing.assert_allclose(starts, pool._G[[0, 2]], atol=1e-9)
 
 
 def test_in_doubt_another_hypothesis_than_the_best_is_optimised_as_well():
