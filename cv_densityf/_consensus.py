@@ -48,8 +48,7 @@ BY_SCORE = -1.0
 SPREAD = -2.0
 _SPREAD_OF = 0.75
 #: Shares of the ranked matches, most reliable first, that hypotheses are drawn from, round by
-#: round. Where fewer than this share of them seem right, all parts but the whole shrink as these
-#: do, to so much at most: most of what is left out is wrong.
+#: round.
 ROUNDS = (
     (0.25, SPREAD),
     (BY_SCORE, 0.75, NEAR),
@@ -58,6 +57,8 @@ ROUNDS = (
     (0.25, NEAR),
     (1.0, NEAR),
 )
+#: Where fewer than this share of the ranked matches seem right, all parts but the whole shrink as
+#: these do, but to no less than so much: most of what is left out is wrong.
 _MOSTLY_RIGHT = 2 / 3
 _SMALLEST = 2 / 3
 #: Matches of so small a part are close together, and nearly all samples pass for planes.
@@ -543,10 +544,7 @@ class _Pool:
         return _noise(squared[self._reliable], self.threshold)
 
     def spread(self, order: Ints, shrunk: float) -> Ints:
-        """Places in an order of reliability of half of its matches, in turn from each cell.
-
-        Or of so much less than half.
-        """
+        """Places in an order of reliability of a ``shrunk`` half of it, in turn from each cell."""
         top = order[: max(MIN_DRAW, int(_SPREAD_OF * shrunk * len(order)))]
         turn = turns(self._ballot.cells[0, top])
         return np.argsort(turn, kind="stable")[: max(MIN_DRAW, 2 * len(top) // 3)]

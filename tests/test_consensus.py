@@ -317,7 +317,7 @@ def test_rivals_of_other_inliers_are_optimised(monkeypatch):
     monkeypatch.setattr(_Pool, "_optimised", spy)
     pool.optimise()
     # Of two copies rounding tells which is the better one.
-    np.testing.assert_allclose(starts, pool._G[[0, 2]], atol=1e-9)
+    assert any(np.array_equal(starts, pool._G[[copy, 2]]) for copy in (0, 1))
 
 
 def test_in_doubt_another_hypothesis_than_the_best_is_optimised_as_well():
